@@ -1,0 +1,115 @@
+"""What is known of a device: noise of its sensors and, later, their deterministic errors; <-> calibration.toml.
+
+Noise densities follow IEEE Std 952: white noise in unit/sqrt(Hz), bias random walk in unit*sqrt(Hz) per second.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cattrs
+import tomli_w
+
+from smartnav_graph.errors import CalibrationError
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Inertial noise that the estimator assumes (not the data sheet's: vibration, quantisation, scale errors included).
+
+    accel_noise_density m/s^2/sqrt(Hz), gyro_noise_density rad/s/sqrt(Hz), accel_bias_walk m/s^3/sqrt(Hz),
+    gyro_bias_walk rad/s^2/sqrt(Hz); turn-on bias sigmas m/s^2 and rad/s.
+    """
+
+    accel_noise_density: float
+    gyro_noise_density: float
+    accel_bias_walk: float
+    gyro_bias_walk: float
+    accel_bias_sigma: float
+    gyro_bias_sigma: float
+
+
+@dataclass(frozen=True)
+class GnssNoise:
+    """Noise of position fixes that carry no sigma of their own: white part per horizontal axis and height, metres."""
+
+    horizontal_sigma: float = 3.0
+    vertical_sigma: float = 5.0
+
+
+# One default a device class, the same for every recording.
+DEVICE_CLASSES: dict[str, ImuNoise] = {
+    # Consumer MEMS in phones and loggers, used in motion.
+    "mems": ImuNoise(
+        accel_noise_density=0.02,
+        gyro_noise_density=5e-4,
+        accel_bias_walk=1e-3,
+        gyro_bias_walk=2e-5,
+        accel_bias_sigma=0.3,
+        gyro_bias_sigma=0.02,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Device calibration as it stands in calibration.toml."""
+
+    device: str = "unknown"
+    device_class: str = "mems"
+    imu_noise: ImuNoise = field(default_factory=lambda: DEVICE_CLASSES["mems"])
+    gnss_noise: GnssNoise = field(default_factory=GnssNoise)
+
+    def __post_init__(self) -> None:
+        for room in (self.imu_noise, self.gnss_noise):
+            for f in dataclasses.fields(room):
+                value = getattr(room, f.name)
+                if not (math.isfinite(value) and value > 0):
+                    raise CalibrationError(
+                        "calibration.toml", f"{f.name} = {value}", "a finite number > 0", "give SI units"
+                    )
+
+
+_converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+def from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
+    """Calibration of a parsed TOML table; missing rooms take the class default, unknown keys are refused."""
+    filled = dict(data)
+    name = filled.get("device_class", "mems")
+    if name not in DEVICE_CLASSES:
+        raise CalibrationError(where, f"device_class = {name!r}", f"one of {', '.join(DEVICE_CLASSES)}")
+    filled["imu_noise"] = dataclasses.asdict(DEVICE_CLASSES[name]) | dict(filled.get("imu_noise", {}))
+    try:
+        return _converter.structure(filled, Calibration)
+    except CalibrationError as error:
+        raise error.located(where) from error
+    except Exception as error:
+        raise CalibrationError(where, "; ".join(cattrs.transform_error(error)), "known keys with numbers") from error
+
+
+def load(path: str | Path) -> Calibration:
+    """Read calibration.toml.
+
+    Raises
+    ------
+    CalibrationError
+        Missing or unreadable file, unknown key, or a value that is not > 0.
+    """
+    path = Path(path)
+    try:
+        return from_dict(tomllib.loads(path.read_text(encoding="utf-8")), path)
+    except OSError as error:
+        raise CalibrationError(path, f"cannot be read ({error.strerror})", "a calibration.toml") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(path, f"is no TOML ({error})", "a calibration.toml") from error
+
+
+def dumps(calibration: Calibration) -> str:
+    """The text of calibration.toml; `from_dict` of it gives the same calibration."""
+    return tomli_w.dumps(dataclasses.asdict(calibration))

@@ -1,0 +1,72 @@
+"""Errors that say where, what was found, what was expected and what to do.
+
+Every message reads ``<where>: <what was found>; expected <rule>; <what to do>``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+
+class SmartnavError(Exception):
+    """Base of every named input or solver fault.
+
+    Parameters
+    ----------
+    where : str or Path
+        File, stream, option or epoch the fault was found at.
+    found : str
+        What stands there, with number and unit.
+    expected : str, optional
+        The rule it breaks.
+    remedy : str, optional
+        What the user can do about it.
+    row : int, optional
+        Zero-based data row.
+    stream : str, optional
+        Name of the session stream concerned.
+    """
+
+    def __init__(
+        self,
+        where: str | Path,
+        found: str,
+        expected: str = "",
+        remedy: str = "",
+        *,
+        row: int | None = None,
+        stream: str | None = None,
+    ) -> None:
+        self.where = str(where)
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+        self.row = row
+        self.stream = stream
+        parts = [f"{self.where}: {found}"]
+        if expected:
+            parts.append(f"expected {expected}")
+        if remedy:
+            parts.append(remedy)
+        super().__init__("; ".join(parts))
+
+    def located(self, where: str | Path) -> Self:
+        """The same fault, told of the file it was read from."""
+        return type(self)(where, self.found, self.expected, self.remedy, row=self.row, stream=self.stream)
+
+
+class SessionError(SmartnavError):
+    """A recorded session, or a foreign log, is missing, unreadable or inconsistent."""
+
+
+class CalibrationError(SmartnavError):
+    """A device calibration is unreadable or physically impossible."""
+
+
+class ConfigError(SmartnavError):
+    """A configuration file, option or withholding specification is wrong."""
+
+
+class SolverError(SmartnavError):
+    """The estimation problem is unobservable, diverged or left without data."""

@@ -1,0 +1,99 @@
+"""Named, counted repairs of faulty tables. Applied only when asked for; the file on disk stays as it is.
+
+=========  ==========================================================================================
+``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped
+``nan``    rows with a non-finite required value dropped
+``stamps`` jittered stamps rebuilt: row order is kept, each stamp becomes its 4 s moving mean
+=========  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.streams import Stream
+from smartnav_graph.timebase import NS
+
+Table = dict[str, NDArray[Any]]
+
+REPAIRS = ("nan", "stamps", "order")
+
+
+def check_names(names: Iterable[str]) -> tuple[str, ...]:
+    """The repairs asked for, in the order they are applied.
+
+    Raises
+    ------
+    ConfigError
+        A name that is no repair.
+    """
+    wanted = set(names)
+    unknown = sorted(wanted - set(REPAIRS))
+    if unknown:
+        raise ConfigError("--repair", f"unknown repair {', '.join(unknown)}", f"some of {', '.join(REPAIRS)}")
+    return tuple(name for name in REPAIRS if name in wanted)
+
+
+def repair(kind: type[Stream], table: Mapping[str, NDArray[Any]], names: Iterable[str]) -> tuple[Table, dict[str, int]]:
+    """Apply `names` to the columns of one stream.
+
+    Returns
+    -------
+    table : the repaired columns
+    counts : rows touched by each reason; empty when nothing was wrong
+    """
+    rows: Table = dict(table)
+    counts: dict[str, int] = {}
+    for name in check_names(names):
+        if "t_ns" in rows and len(rows["t_ns"]):
+            rows, found = {"nan": _drop_nan, "order": _sort, "stamps": _rebuild_stamps}[name](kind, rows)
+            counts |= {reason: count for reason, count in found.items() if count}
+    return rows, counts
+
+
+def _keep(rows: Table, chosen: NDArray[Any]) -> Table:
+    return {name: np.asarray(column)[chosen] for name, column in rows.items()}
+
+
+def _drop_nan(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
+    required = [
+        name
+        for spec in kind.specs()
+        if spec.metadata["kind"] == "float" and not spec.metadata["nan"]
+        for name in spec.metadata["columns"]
+        if name in rows
+    ]
+    good = np.ones(len(rows["t_ns"]), dtype=bool)
+    for name in required:
+        good &= np.isfinite(np.asarray(rows[name], dtype=np.float64))
+    return _keep(rows, good), {"non-finite rows dropped": int((~good).sum())}
+
+
+def _sort(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
+    t = np.asarray(rows["t_ns"], dtype=np.int64)
+    moved = int((np.diff(t) < 0).sum())
+    rows = _keep(rows, np.argsort(t, kind="stable"))
+    repeated = 0
+    if kind.UNIQUE_TIMES:
+        first = np.concatenate([[True], np.diff(np.asarray(rows["t_ns"], dtype=np.int64)) > 0])
+        repeated = int((~first).sum())
+        rows = _keep(rows, first)
+    return rows, {"disordered rows sorted": moved, "repeated stamps dropped": repeated}
+
+
+def _rebuild_stamps(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
+    t = np.asarray(rows["t_ns"], dtype=np.int64)
+    order = np.sort(t)
+    period = float(np.median(np.diff(order))) / NS if len(t) > 1 else 0.0
+    width = max(3, round(4.0 / period)) | 1 if period > 0 else 3
+    index = np.arange(len(t), dtype=np.float64)
+    slope = (order[-1] - order[0]) / max(len(t) - 1, 1)
+    smooth = uniform_filter1d((t - t[0]) - slope * index, width, mode="nearest") + slope * index
+    rebuilt = np.rint(smooth).astype(np.int64) + t[0]
+    return rows | {"t_ns": rebuilt}, {"stamps rebuilt": len(t)}
