@@ -109,7 +109,7 @@ def axis_vector(name: str) -> Floats:
     """
     if name not in _AXES:
         raise SessionError("session.toml [device]", f"axis {name!r}", "one of +x, -x, +y, -y, +z, -z")
-    return _AXES[name].copy()
+    return np.asarray(_AXES[name].copy())
 
 
 def body_R_vehicle(forward: str, up: str) -> Floats:

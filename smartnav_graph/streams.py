@@ -59,7 +59,7 @@ class Stream:
 
     def _checked(self, spec: Field[Any], value: Any) -> Array:
         names, kind = spec.metadata["columns"], spec.metadata["kind"]
-        array = np.array(value, dtype=_DTYPES[kind])
+        array: Array = np.array(value, dtype=_DTYPES[kind])
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
         if array.shape != shape:
             raise SessionError(
@@ -117,7 +117,7 @@ class Stream:
     def take(self, rows: NDArray[Any] | slice) -> Self:
         """The same stream with only these rows (mask, indices or slice)."""
         values = {f.name: getattr(self, f.name) for f in self.specs()}
-        chosen = {name: None if value is None else value[rows] for name, value in values.items()}
+        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
         return type(self)(**chosen, extra={name: value[rows] for name, value in self.extra.items()})
 
     def columns(self) -> dict[str, Array]:
@@ -147,7 +147,7 @@ class Stream:
             there = [name for name in names if name in table]
             known.update(there)
             if len(there) == len(names):
-                rows = [np.asarray(table[name], dtype=_DTYPES[spec.metadata["kind"]]) for name in names]
+                rows: list[Array] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
                 values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
             elif there or spec.default is MISSING:
                 missing = [name for name in names if name not in table]
