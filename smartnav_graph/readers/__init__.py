@@ -1,0 +1,61 @@
+"""Foreign logs -> Session. One module a format; `READERS` names them all.
+
+A reader changes units and the sign of specific force, never axes, and keeps the source's own clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.readers import gtsam_kitti
+from smartnav_graph.readers.source import Reader
+from smartnav_graph.session import Session
+
+READERS: dict[str, Reader] = {reader.name: reader for reader in (gtsam_kitti.READER,)}
+
+__all__ = ["READERS", "Reader", "find", "read"]
+
+
+def find(source: str | Path, name: str | None = None) -> Reader:
+    """The reader called `name`, else the one that recognises `source`.
+
+    Raises
+    ------
+    SessionError
+        The name is unknown, the source is missing, or none or several readers recognise it.
+    """
+    names = ", ".join(READERS)
+    if name is not None:
+        if name not in READERS:
+            raise SessionError("--format", f"unknown format {name!r}", f"one of {names}", "see `smartnav formats`")
+        return READERS[name]
+    found = [reader for reader in READERS.values() if reader.matches(str(source))]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        several = ", ".join(reader.name for reader in found)
+        raise SessionError(source, f"is recognised as {several}", "one format", "choose one with --format")
+    if not Path(source).exists():
+        raise SessionError(source, "does not exist", "a file, a folder, gtsam-kitti or gtsam-euroc", "check the path")
+    raise SessionError(
+        source, "is of no known format", f"one of {names}", "see `smartnav formats`, or name it with --format"
+    )
+
+
+def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = ()) -> Session:
+    """The session of a foreign log.
+
+    Parameters
+    ----------
+    source : file or folder, or the literal ``gtsam-kitti`` / ``gtsam-euroc`` (found in the gtsam package)
+    name : format; by default recognised by content
+    repairs : names of `smartnav_graph.repair` to apply; what they touched is counted in `Session.dropped`
+
+    Raises
+    ------
+    SessionError
+        Unknown format, missing or unreadable file, wrong column, a cell that is no number, faulty rows.
+    """
+    return find(source, name).read(source, repairs=repairs)

@@ -1,0 +1,101 @@
+"""What a reader is: a name, how it recognises a source, and how it turns one into a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.session import Session, build_stream
+from smartnav_graph.streams import STREAMS, Stream
+
+Columns = dict[str, NDArray[Any]]
+
+
+class ReadFunction(Protocol):
+    """Source and names of repairs -> session."""
+
+    def __call__(self, source: str, repairs: tuple[str, ...]) -> Session: ...
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One foreign format.
+
+    name : what ``--format`` calls it
+    summary : what it is, one line
+    recognised_by : how a source is told to be of this format, one line
+    matches : cheap check of names and first lines; never raises for a source of another format
+    read_source : the conversion itself
+    """
+
+    name: str
+    summary: str
+    recognised_by: str
+    matches: Callable[[str], bool]
+    read_source: ReadFunction
+
+    def read(self, source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
+        """The session of `source`.
+
+        Parameters
+        ----------
+        source : file, folder or literal name
+        repairs : names of `smartnav_graph.repair`, applied to every stream and counted in `Session.dropped`
+
+        Raises
+        ------
+        SessionError
+            Missing or unreadable file, wrong or missing column, a cell that is no number, faulty rows.
+        """
+        return self.read_source(str(source), tuple(repairs))
+
+
+def vector_columns(template: str, rows: NDArray[np.float64], axes: str = "xyz") -> Columns:
+    """Columns of the rows (n, k) of a vector: ``{}`` in `template` becomes the axis."""
+    return {template.format(axis): column for axis, column in zip(axes, rows.T, strict=True)}
+
+
+def build_session(tables: Mapping[str, tuple[Path, Columns]], repairs: tuple[str, ...], **header: Any) -> Session:
+    """A session of file columns: stream name -> (file they came from, columns).
+
+    The repairs are done here and counted in `Session.dropped`; `Session.repairs` stays empty, because a session
+    saved from this needs none.
+
+    Raises
+    ------
+    SessionError
+        A column is missing or a row is faulty; the error names the file.
+    """
+    streams: dict[str, Stream] = {}
+    dropped: dict[str, dict[str, int]] = {}
+    for name, (file, columns) in tables.items():
+        if not len(columns["t_ns"]):
+            raise SessionError(file, "has no rows", "at least one row", stream=name)
+        streams[name], counts = build_stream(STREAMS[name], columns, file, repairs)
+        dropped |= {name: counts} if counts else {}
+    return Session(dropped=dropped, **header, **streams)
+
+
+def example_file(name: str) -> Path:
+    """Path of a data file inside the gtsam package.
+
+    Raises
+    ------
+    SessionError
+        The installed gtsam does not ship it.
+    """
+    import gtsam
+
+    find: Callable[[str], str] = gtsam.findExampleDataFile
+    try:
+        return Path(find(name))
+    except RuntimeError as error:
+        raise SessionError(
+            name, "is not among the data files of the installed gtsam", "gtsam 4.3", "pip install 'gtsam>=4.3,<4.4'"
+        ) from error

@@ -1,0 +1,193 @@
+"""Delimited text -> columns, with faults told by file, row and value."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+import pyarrow.csv
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.timebase import NS, Times, ns_from_text, ns_from_texts
+
+Floats = NDArray[np.float64]
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises
+    ------
+    SessionError
+        Missing or unreadable.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise SessionError(path, "is missing", "a text file", "check the path") from error
+    except OSError as error:
+        raise SessionError(path, f"cannot be read ({error.strerror})", "a readable file", "check the path") from error
+
+
+def first_lines(path: Path, count: int = 2) -> list[str]:
+    """The first lines of a text file, stripped; none where the file cannot be read as text."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return [line.strip() for line, _ in zip(file, range(count), strict=False)]
+    except (OSError, UnicodeDecodeError):
+        return []
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Cells of a delimited text file, still as text; conversion on demand, so that stamps keep every digit."""
+
+    path: Path
+    cells: dict[str, pa.Array]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.cells.values())))
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raise SessionError unless every column of `names` is there."""
+        missing = [name for name in names if name not in self.cells]
+        if missing:
+            raise SessionError(
+                self.path,
+                f"column {', '.join(missing)} is missing",
+                f"columns {', '.join(names)}",
+                f"the file has {', '.join(self.cells)}; rename or add the column",
+            )
+
+    def texts(self, name: str) -> NDArray[Any]:
+        """Cells as text (object array); empty where empty."""
+        return np.array(self.cells[name].to_pylist(), dtype=object)
+
+    def floats(self, *names: str) -> Floats:
+        """One column (n,) or several (n, k) as numbers; empty cells become NaN."""
+        columns = [self._numbers(name, pa.float64()).to_numpy(zero_copy_only=False) for name in names]
+        return np.asarray(columns[0] if len(names) == 1 else np.stack(columns, axis=-1), dtype=np.float64)
+
+    def ints(self, name: str) -> Times:
+        """One column as int64; every cell must hold a whole number."""
+        numbers = self._numbers(name, pa.int64(), "a whole number")
+        if numbers.null_count:
+            raise self._bad_cell(name, int(np.flatnonzero(numbers.is_null())[0]), "a whole number")
+        return np.asarray(numbers.to_numpy(), dtype=np.int64)
+
+    def times(self, name: str, unit_ns: int = NS) -> Times:
+        """One column of decimal clock readings in units of `unit_ns` as exact nanoseconds."""
+        texts = self.cells[name].to_pylist()
+        try:
+            return ns_from_texts(texts, unit_ns)
+        except SessionError as error:
+            row = next(i for i, text in enumerate(texts) if not _is_time(text, unit_ns))
+            raise self._bad_cell(name, row, "a decimal number") from error
+
+    def is_empty(self, name: str) -> bool:
+        """Whether no row of the column holds anything."""
+        return not any(self.cells[name].to_pylist())
+
+    def _numbers(self, name: str, kind: pa.DataType, what: str = "a number") -> pa.Array:
+        cells = self.cells[name]
+        filled = pa.compute.if_else(pa.compute.equal(cells, ""), pa.scalar(None, pa.string()), cells)
+        try:
+            return filled.cast(kind)
+        except pa.ArrowInvalid as error:
+            row = next(i for i, text in enumerate(filled.to_pylist()) if not _casts(text, kind))
+            raise self._bad_cell(name, row, what) from error
+
+    def _bad_cell(self, name: str, row: int, expected: str) -> SessionError:
+        found = f"{name} is {self.cells[name][row].as_py()!r} at row {row}"
+        return SessionError(self.path, found, expected, "correct or delete the row", row=row)
+
+
+def _casts(text: str | None, kind: pa.DataType) -> bool:
+    try:
+        pa.scalar(text, pa.string()).cast(kind)
+    except pa.ArrowInvalid:
+        return False
+    return True
+
+
+def _is_time(text: str, unit_ns: int) -> bool:
+    try:
+        ns_from_text(text, unit_ns)
+    except SessionError:
+        return False
+    return True
+
+
+def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
+    """Read comma, semicolon, tab or blank separated text.
+
+    Parameters
+    ----------
+    path : the file; UTF-8
+    names : column names, for files without a heading line; by default the first line (a leading # is taken off)
+
+    Lines that start with # after the heading are comments. Row numbers in errors count data rows from zero.
+
+    Raises
+    ------
+    SessionError
+        Missing, unreadable, no text, no rows, rows of different length, or a column name twice.
+    """
+    heading, body = _split(path, with_heading=names is None)
+    separator = _separator(heading if names is None else body[:4096].split(b"\n", 1)[0])
+    columns = list(names) if names is not None else _heading_names(heading, separator)
+    if len(set(columns)) != len(columns):
+        twice = sorted({name for name in columns if columns.count(name) > 1})
+        raise SessionError(path, f"column {', '.join(map(repr, twice))} stands twice", "each column once")
+    if not body.strip():
+        raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
+    if separator == " ":
+        body = re.sub(rb"[ \t]+", b" ", body)
+        body = re.sub(rb"(?m)^ | (?=\r?$)", b"", body)
+    return TextTable(path, _parse(path, body, columns, separator))
+
+
+def _split(path: Path, *, with_heading: bool) -> tuple[bytes, bytes]:
+    data = read_bytes(path).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if b"\0" in data[:4096]:
+        raise SessionError(path, "is no text (it holds zero bytes)", "a text file", "check the format")
+    heading = b""
+    if with_heading:
+        heading, _, data = data.partition(b"\n")
+    if b"#" in data:
+        data = re.sub(rb"(?m)^[ \t]*#.*\n?", b"", data)
+    return heading.strip(), data
+
+
+def _separator(line: bytes) -> str:
+    for separator in (b",", b";", b"\t"):
+        if separator in line:
+            return separator.decode()
+    return " "
+
+
+def _heading_names(heading: bytes, separator: str) -> list[str]:
+    text = heading.decode("utf-8", errors="replace").lstrip("# ")
+    return [name.strip().strip('"') for name in (text.split() if separator == " " else text.split(separator))]
+
+
+def _parse(path: Path, body: bytes, columns: list[str], separator: str) -> dict[str, pa.Array]:
+    try:
+        table = pyarrow.csv.read_csv(
+            io.BytesIO(body),
+            read_options=pyarrow.csv.ReadOptions(column_names=columns, use_threads=False),
+            parse_options=pyarrow.csv.ParseOptions(delimiter=separator),
+            convert_options=pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(columns, pa.string())),
+        )
+    except pa.ArrowInvalid as error:
+        raise SessionError(path, f"is no table of {len(columns)} columns ({error})", "rows of one length") from error
+    trim = pa.compute.utf8_trim_whitespace
+    return {name: trim(table.column(name).combine_chunks()) for name in columns}
