@@ -32,6 +32,8 @@ class Origin:
     height_m: float
 
     def __post_init__(self) -> None:
+        for name in ("lat_deg", "lon_deg", "height_m"):  # numpy scalars print as np.float64(...), which PROJ reads as 0
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not (abs(self.lat_deg) <= 90.0 and abs(self.lon_deg) <= 360.0 and np.isfinite(self.height_m)):
             raise SessionError(
                 "session.toml [origin]",

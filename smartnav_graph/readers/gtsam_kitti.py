@@ -7,6 +7,7 @@ forward, left, up; positions are metres in a local ENU-like frame without stated
 from __future__ import annotations
 
 from pathlib import Path
+
 from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session import Device, Session
