@@ -1,0 +1,1 @@
+"""Simulated sessions with exact truth, and faults for real ones."""

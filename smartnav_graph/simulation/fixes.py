@@ -1,0 +1,149 @@
+"""Errors of position fixes: white noise, a first-order Gauss-Markov process, outliers, outages; control points.
+
+Horizontal sigmas are per axis; the vertical ones are 1.5 times as large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.frames import LocalFrame
+from smartnav_graph.simulation.trajectory import Truth
+from smartnav_graph.streams import ControlPoint, GnssFix
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+AXES = np.array([1.0, 1.0, 1.5])
+BURST_S = (4.0, 9.0)
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """`share` of the fixes is off by `low_m` .. `high_m` in a random horizontal direction.
+
+    kind ``isolated``: single fixes, never two in a row. kind ``burst``: runs of 4 to 9 s that share one offset.
+    """
+
+    kind: str
+    share: float
+    low_m: float
+    high_m: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("isolated", "burst"):
+            raise ConfigError("--outliers", f"kind {self.kind!r}", "isolated or burst")
+        if not 0.0 < self.share <= 0.45:
+            raise ConfigError("--outliers", f"share {self.share}", "a share above 0, up to 0.45")
+        if not 0.0 < self.low_m <= self.high_m:
+            raise ConfigError("--outliers", f"size {self.low_m}-{self.high_m} m", "0 < smallest <= largest")
+
+
+@dataclass(frozen=True)
+class GnssModel:
+    """A receiver: `rate_hz`, white sigma, Gauss-Markov sigma and correlation time, lever arm, outages (start s,
+    length s) and outliers."""
+
+    rate_hz: float = 1.0
+    white_m: float = 3.0
+    markov_m: float = 0.0
+    markov_s: float = 60.0
+    body_t_antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    outages: tuple[tuple[float, float], ...] = ()
+    outliers: Outliers | None = None
+
+
+def white(n: int, sigma: float, rng: np.random.Generator) -> Floats:
+    """(n, 3) m: independent errors, `sigma` per horizontal axis."""
+    return np.asarray(sigma * AXES * rng.standard_normal((n, 3)))
+
+
+def gauss_markov(t_ns: Times, sigma: float, tau_s: float, rng: np.random.Generator) -> Floats:
+    """(n, 3) m: stationary first-order Gauss-Markov errors with E[x(t) x(t + d)] = sigma^2 exp(-|d| / tau).
+
+    x_k+1 = phi x_k + sigma sqrt(1 - phi^2) n, phi = exp(-dt / tau), x_0 = sigma n (Gelb 1974, ch. 3.6).
+    """
+    drive = rng.standard_normal((len(t_ns), 3))
+    phi = np.exp(-np.diff(t_ns) / NS / tau_s)
+    rows = [drive[0]] if len(drive) else []
+    for k, p in enumerate(phi):
+        rows.append(p * rows[-1] + np.sqrt(1.0 - p * p) * drive[k + 1])
+    return np.asarray(sigma * AXES * np.array(rows).reshape(-1, 3))
+
+
+def place_runs(n: int, lengths: Sequence[int], rng: np.random.Generator, *, apart: bool) -> list[int]:
+    """First rows of runs of these lengths, put at random without overlap into n rows, in this order.
+
+    `apart` keeps at least one free row between two runs.
+
+    Raises
+    ------
+    ConfigError
+        There is no room.
+    """
+    free = n - sum(lengths)
+    slots = free + 1 if apart else free + len(lengths)
+    if free < 0 or len(lengths) > slots:
+        raise ConfigError("degrade", f"{sum(lengths)} faulty rows of {n}", "fewer faults than rows", "lower the share")
+    chosen = np.sort(rng.choice(slots, len(lengths), replace=False))
+    before = np.cumsum([0, *lengths[:-1]])[: len(lengths)]
+    return [int(row) for row in (chosen + before if apart else chosen + before - np.arange(len(lengths)))]
+
+
+def outlier_errors(t_ns: Times, outliers: Outliers, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+    """Errors (n, 3) m, zero but for the outliers, and their mask (n,): exactly round(share n) of them.
+
+    The last burst is cut to keep the count.
+    """
+    n = len(t_ns)
+    left = round(outliers.share * n)
+    period = float(np.median(np.diff(t_ns))) / NS if n > 1 else 1.0
+    lengths: list[int] = []
+    while left > 0:
+        wish = 1 if outliers.kind == "isolated" else max(1, round(float(rng.uniform(*BURST_S)) / period))
+        lengths.append(min(wish, left))
+        left -= lengths[-1]
+    errors, mask = np.zeros((n, 3)), np.zeros(n, dtype=bool)
+    for row, length in zip(place_runs(n, lengths, rng, apart=True), lengths, strict=True):
+        size, angle = rng.uniform(outliers.low_m, outliers.high_m), rng.uniform(0.0, 2 * np.pi)
+        errors[row : row + length] = size * np.array([np.cos(angle), np.sin(angle), 0.0])
+        mask[row : row + length] = True
+    return errors, mask
+
+
+def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np.random.Generator) -> GnssFix:
+    """Fixes of the antenna at `truth` (one row a fix); the sigma columns hold the white part only.
+
+    Column `is_outlier` (kept in `extra`) marks outliers with 1.
+    """
+    heard = np.ones(len(truth), dtype=bool)
+    for start, length in model.outages:
+        heard &= ~((truth.t >= start) & (truth.t < start + length))
+    truth, t_ns = truth.take(heard), t_ns[heard]
+    n = len(t_ns)
+    enu = truth.nav_t_body + truth.nav_R_body @ np.asarray(model.body_t_antenna) + white(n, model.white_m, rng)
+    if model.markov_m > 0:
+        enu = enu + gauss_markov(t_ns, model.markov_m, model.markov_s, rng)
+    mask = np.zeros(n, dtype=bool)
+    if model.outliers is not None:
+        errors, mask = outlier_errors(t_ns, model.outliers, rng)
+        enu = enu + errors
+    sigma = np.tile(model.white_m * AXES, (n, 1))
+    extra = {"is_outlier": mask.astype(np.int64)} if model.outliers is not None else {}
+    return GnssFix(t_ns=t_ns, lla=frame.lla_from_nav(enu), sigma=sigma, extra=extra)
+
+
+def control(
+    truth: Truth, t_ns: Times, names: Sequence[str], sigma_m: float, frame: LocalFrame, rng: np.random.Generator
+) -> ControlPoint:
+    """Surveyed points under the device at `truth` (one row a point), off by `sigma_m` per axis."""
+    n = len(t_ns)
+    enu = truth.nav_t_body + sigma_m * rng.standard_normal((n, 3))
+    sigma = np.full((n, 3), sigma_m)
+    return ControlPoint(t_ns=t_ns, lla=frame.lla_from_nav(enu), point_id=np.array(names, dtype=object), sigma=sigma)

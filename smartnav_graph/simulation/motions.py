@@ -1,0 +1,77 @@
+"""The named motions: static, walk, car, trolley, figure eight; each a Trajectory of at least the asked duration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from smartnav_graph.simulation.trajectory import Eight, Leg, Legs, Sway, Trajectory
+
+# A hand-held phone at 1.35 m/s, 1.9 steps a second: up and down with the step, sideways and roll with the stride.
+_STEPS = (
+    Sway(hertz=1.9, shift=(0.0, 0.008, 0.018), tilt=(0.0, 0.03, 0.0)),
+    Sway(hertz=0.95, shift=(0.015, 0.0, 0.0), tilt=(0.03, 0.0, 0.04), phase=0.7),
+)
+# A car body on its springs at 15 m/s.
+_SPRINGS = (
+    Sway(hertz=1.3, shift=(0.0, 0.0, 0.004), tilt=(0.0, 0.003, 0.0)),
+    Sway(hertz=1.7, tilt=(0.0, 0.0, 0.003), phase=1.1),
+    Sway(hertz=11.0, shift=(0.0, 0.0, 5e-5), phase=0.4),
+)
+
+
+def static(duration: float) -> Trajectory:
+    """A device at rest, tilted by 5 deg in pitch and -3 deg in roll, heading 40 deg."""
+    return Trajectory(Legs([Leg(duration, 0.0)], heading_deg=40.0), held_deg=(0.0, 5.0, -3.0))
+
+
+def walk(duration: float, rng: np.random.Generator) -> Trajectory:
+    """A pedestrian, phone in front and pitched up 35 deg: 5 s rest, straights of 8 to 20 s at about 1.35 m/s, turns of
+    60 to 120 deg, and a rest of 4 to 8 s after every sixth turn on average."""
+    legs = [Leg(5.0, 0.0), Leg(1.5, 1.3)]
+    while sum(leg.seconds for leg in legs) < duration:
+        pace = float(rng.uniform(1.2, 1.5))
+        legs += [
+            Leg(float(rng.uniform(8, 20)), pace),
+            Leg(2.5, pace, float(rng.choice([-1, 1]) * rng.uniform(60, 120))),
+        ]
+        if rng.random() < 1 / 6:
+            legs += [Leg(1.5, 0.0), Leg(float(rng.uniform(4, 8)), 0.0), Leg(1.5, pace)]
+    heading = float(rng.uniform(0, 360))
+    return Trajectory(Legs(legs, heading_deg=heading), held_deg=(0.0, 35.0, 4.0), sway=_STEPS, sway_speed=1.35)
+
+
+def car(duration: float, rng: np.random.Generator, *, start_speed: float = 0.0) -> Trajectory:
+    """A car in town, body axes aligned with it: straights at 9 to 18 m/s with slopes up to 3 deg, turns of 60 to 110
+    deg at 5 to 8 m/s, stops of 5 to 15 s at every fourth turn on average. It rests for 10 s first unless it starts
+    at `start_speed` m/s."""
+    legs = [Leg(10.0, 0.0)] if start_speed == 0.0 else []
+    while sum(leg.seconds for leg in legs) < duration:
+        fast, slow = float(rng.uniform(9, 18)), float(rng.uniform(5, 8))
+        bend, turn = float(rng.uniform(-15, 15)), float(rng.choice([-1, 1]) * rng.uniform(60, 110))
+        slope = float(rng.uniform(-3, 3))
+        legs += [Leg(7.0, fast), Leg(float(rng.uniform(8, 25)), fast, bend, slope), Leg(6.0, slow)]
+        if rng.random() < 1 / 4:
+            legs += [Leg(4.0, 0.0), Leg(float(rng.uniform(5, 15)), 0.0), Leg(4.0, slow)]
+        legs.append(Leg(6.0, slow, turn))
+    way = Legs(legs, speed=start_speed, heading_deg=float(rng.uniform(0, 360)))
+    return Trajectory(way, sway=_SPRINGS, sway_speed=15.0)
+
+
+def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajectory:
+    """A trolley pushed round a rectangle of corridors that closes on itself, at 1 m/s.
+
+    It rests for `rest` s, then stops for `stop` s in the middle of every side; one round takes four stops.
+    """
+    legs = [Leg(rest, 0.0)]
+    for side in (30.0, 15.0) * 2 * rounds:
+        half = [Leg(2.0, 1.0), Leg(side / 2, 1.0)]
+        legs += [*half, Leg(4.0, 1.0, 90.0), Leg(side / 2, 1.0), Leg(2.0, 0.0), Leg(stop, 0.0)]
+    sway = (Sway(hertz=6.0, shift=(0.0, 0.0, 2e-4), tilt=(0.0, 0.001, 0.0)),)
+    return Trajectory(Legs(legs, heading_deg=25.0), sway=sway)
+
+
+def figure_eight(duration: float) -> Trajectory:
+    """A phone carried round a figure eight of 20 s at 1.5 m/s after 5 s of rest, tilting gently."""
+    way = Eight(duration, rest=5.0, ramp=5.0, period=20.0, speed=1.5)
+    sway = (Sway(hertz=0.4, tilt=(0.1, 0.2, 0.25)), Sway(hertz=0.9, shift=(0.01, 0.01, 0.03), phase=0.5))
+    return Trajectory(way, held_deg=(0.0, 10.0, 0.0), sway=sway, sway_speed=1.5)

@@ -1,0 +1,140 @@
+"""What the sensors of a device read along an exact motion: inertial, magnetometer, barometer.
+
+Every sample is the true instantaneous quantity at its own stamp, plus bias and noise, as a real sensor gives it; it is
+no mean over the interval before or after. Whoever holds sample k constant over [t_k, t_k+1] therefore makes an error
+of first order in the interval; the mean of neighbouring samples is right to second order.
+Noise models: IEEE Std 952 (white noise and rate random walk).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
+from smartnav_graph.frames import STANDARD_GRAVITY
+from smartnav_graph.simulation.trajectory import Truth
+from smartnav_graph.streams import Barometer, Imu, Magnetometer
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class DeviceProfile:
+    """A device and the noise its simulated sensors really have (the same on all three axes)."""
+
+    name: str
+    noise: ImuNoise
+
+
+def _profile(
+    name: str, accel_noise: Sequence[float], gyro_noise: Sequence[float], accel_bias: float, gyro_bias: float
+) -> DeviceProfile:
+    """Profile of published sample sigmas by axis at 100 Hz: their quadratic mean, density = sigma / sqrt(100 Hz).
+
+    Bias walks were not published; they are those of the class.
+    """
+    accel, gyro = (float(np.sqrt(np.mean(np.square(sigma)) / 100.0)) for sigma in (accel_noise, gyro_noise))
+    noise = dataclasses.replace(
+        DEVICE_CLASSES["mems"],
+        accel_noise_density=accel,
+        gyro_noise_density=gyro,
+        accel_bias_sigma=accel_bias,
+        gyro_bias_sigma=gyro_bias,
+    )
+    return DeviceProfile(name, noise)
+
+
+_MILLI_G = STANDARD_GRAVITY / 1000.0
+
+PROFILES: dict[str, DeviceProfile] = {
+    "mems": DeviceProfile("mems", DEVICE_CLASSES["mems"]),
+    # Turn-on bias sigmas: quadratic mean of the one published bias (0.396, -0.068, 0.124) and (1.62, 0.68, -4.89) e-3.
+    "galaxy-s2": _profile("galaxy-s2", (0.0386, 0.0297, 0.0435), (2.20e-3, 2.52e-3, 3.08e-3), 0.24, 3.0e-3),
+    "galaxy-s5": _profile(
+        "galaxy-s5", (4.6 * _MILLI_G, 6.1 * _MILLI_G, 0.2 * _MILLI_G), (1.7e-3, 2.8e-3, 0.9e-3), 0.2, 3.0e-3
+    ),
+    "iphone-4": _profile(
+        "iphone-4", (2.8 * _MILLI_G, 2.4 * _MILLI_G, 4.2 * _MILLI_G), (4.8e-3, 3.2e-3, 4.3e-3), 0.2, 5.0e-3
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Biases:
+    """True biases of every sample: accel (n, 3) m/s^2, gyro (n, 3) rad/s, body axes."""
+
+    accel: Floats
+    gyro: Floats
+
+
+def specific_force(truth: Truth, gravity: float) -> Floats:
+    """f = nav_R_body^T (a - g) with g = (0, 0, -gravity) in ENU; (n, 3) m/s^2 in body axes.
+
+    A device lying flat at rest reads +gravity on z.
+    """
+    lifted = truth.nav_a_body + np.array([0.0, 0.0, gravity])
+    return np.asarray(np.einsum("nji,nj->ni", truth.nav_R_body, lifted))
+
+
+def random_walk(t_ns: Times, start_sigma: float, walk: float, rng: np.random.Generator) -> Floats:
+    """Three axes of b_k+1 = b_k + walk sqrt(dt) n, b_0 = start_sigma n; (n, 3)."""
+    steps = rng.standard_normal((len(t_ns), 3))
+    scale = np.concatenate([[start_sigma], walk * np.sqrt(np.diff(t_ns) / NS)])
+    return np.cumsum(steps * scale[:, None], axis=0)
+
+
+def imu(
+    truth: Truth, t_ns: Times, noise: ImuNoise | None, gravity: float, rng: np.random.Generator
+) -> tuple[Imu, Biases]:
+    """Inertial samples at the stamps `t_ns` of `truth`, and their true biases; `noise` None gives the exact ones.
+
+    White noise has sigma = density / sqrt(dt), dt the median interval. Earth rotation is not simulated.
+    """
+    accel, gyro = specific_force(truth, gravity), truth.body_rate
+    if noise is None:
+        nothing = np.zeros_like(accel)
+        return Imu(t_ns=t_ns, gyro=gyro, accel=accel), Biases(nothing, nothing)
+    root_rate = 1.0 / np.sqrt(float(np.median(np.diff(t_ns))) / NS)
+    biases = Biases(
+        random_walk(t_ns, noise.accel_bias_sigma, noise.accel_bias_walk, rng),
+        random_walk(t_ns, noise.gyro_bias_sigma, noise.gyro_bias_walk, rng),
+    )
+    accel = accel + biases.accel + noise.accel_noise_density * root_rate * rng.standard_normal(accel.shape)
+    gyro = gyro + biases.gyro + noise.gyro_noise_density * root_rate * rng.standard_normal(gyro.shape)
+    return Imu(t_ns=t_ns, gyro=gyro, accel=accel), biases
+
+
+def magnetometer(
+    truth: Truth,
+    t_ns: Times,
+    nav_field_ut: Floats,
+    rng: np.random.Generator,
+    *,
+    hard_iron_sigma_ut: float = 1.0,
+    sigma_ut: float = 0.5,
+) -> Magnetometer:
+    """m = nav_R_body^T B + hard iron + white noise, uT; the hard iron is constant, drawn once."""
+    hard_iron = hard_iron_sigma_ut * rng.standard_normal(3)
+    field = np.einsum("nji,j->ni", truth.nav_R_body, nav_field_ut) + hard_iron
+    return Magnetometer(t_ns=t_ns, field_ut=field + sigma_ut * rng.standard_normal(field.shape))
+
+
+def standard_pressure(height_m: Floats) -> Floats:
+    """Pressure in hPa of the ICAO standard atmosphere below 11 km: 1013.25 (1 - 0.0065 h / 288.15)^5.25588."""
+    return np.asarray(1013.25 * (1.0 - 0.0065 * height_m / 288.15) ** 5.25588)
+
+
+def barometer(
+    height_m: Floats, t_ns: Times, rng: np.random.Generator, *, offset_sigma_hpa: float = 1.0, sigma_hpa: float = 0.03
+) -> Barometer:
+    """Standard pressure at `height_m` (n,) + a constant offset (the day's weather, the sensor) + white noise."""
+    offset = offset_sigma_hpa * rng.standard_normal()
+    noise = sigma_hpa * rng.standard_normal(len(t_ns))
+    return Barometer(t_ns=t_ns, pressure_hpa=standard_pressure(height_m) + offset + noise)
