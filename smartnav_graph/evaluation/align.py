@@ -1,0 +1,300 @@
+"""Bringing a solution and a reference together: association in time, time offset, alignment in space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation, Slerp
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.streams import Reference
+from smartnav_graph.timebase import NS, interpolate, seconds_since
+
+Floats = NDArray[np.float64]
+
+METHODS = ("none", "yaw", "se3", "sim3")
+
+_SEARCH_ROWS = 2000  # reference rows the search for a time offset looks at; more change it by less than a millisecond
+_CANDIDATES = 5  # peaks of the speed correlation that are refined
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The similarity p_ref = scale R p_est + t; R (3, 3), t (3,) m."""
+
+    R: Floats
+    t: Floats
+    scale: float = 1.0
+
+    def position(self, rows: Floats) -> Floats:
+        """Aligned positions (n, 3)."""
+        return np.asarray(self.scale * rows @ self.R.T + self.t)
+
+    def vector(self, rows: Floats) -> Floats:
+        """Aligned velocities (n, 3)."""
+        return np.asarray(self.scale * rows @ self.R.T)
+
+    def rotation(self, rotations: Floats) -> Floats:
+        """Aligned attitudes (n, 3, 3)."""
+        return np.asarray(self.R @ rotations)
+
+    def covariance(self, blocks: Floats, *, scaled: bool = True) -> Floats:
+        """Aligned covariances (n, 3, 3); angles are not `scaled`."""
+        return np.asarray((self.scale**2 if scaled else 1.0) * self.R @ blocks @ self.R.T)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Plain states at n times, of a solution or of a reference: what is not known is None.
+
+    t_ns (n,) on the solution's clock; position (n, 3) m; rotation (n, 3, 3) nav_R_body; velocity (n, 3) m/s;
+    covariance (n, 9, 9) of rotation, position, velocity, nav axes; sigma (n, 3) m.
+    """
+
+    t_ns: NDArray[np.int64]
+    position: Floats
+    rotation: Floats | None = None
+    velocity: Floats | None = None
+    covariance: Floats | None = None
+    sigma: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def take(self, rows: NDArray[np.bool_] | slice) -> Track:
+        """Only these rows."""
+        values: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
+        return Track(**chosen)
+
+    def inside(self, other: Track) -> NDArray[np.bool_]:
+        """Mask of the rows that lie within the span of `other`."""
+        return np.asarray((self.t_ns >= other.t_ns[0]) & (self.t_ns <= other.t_ns[-1]))
+
+    def at(self, t_ns: NDArray[np.int64]) -> Track:
+        """Interpolated: linear, attitude by slerp. Covariances linear too, which keeps them positive definite."""
+
+        def rows(values: Floats | None) -> Floats | None:
+            if values is None:
+                return None
+            flat = interpolate(t_ns, self.t_ns, values.reshape(len(self), -1))
+            return flat.reshape(len(t_ns), *values.shape[1:])
+
+        position = rows(self.position)
+        assert position is not None
+        return Track(
+            t_ns=t_ns,
+            position=position,
+            rotation=self._rotation_at(t_ns),
+            velocity=rows(self.velocity),
+            covariance=rows(self.covariance),
+            sigma=rows(self.sigma),
+        )
+
+    def _rotation_at(self, t_ns: NDArray[np.int64]) -> Floats | None:
+        if self.rotation is None:
+            return None
+        if len(self) == 1:
+            return np.repeat(self.rotation, len(t_ns), axis=0)
+        t0 = int(self.t_ns[0])
+        own, wanted = seconds_since(self.t_ns, t0), seconds_since(t_ns, t0)
+        slerp = Slerp(own, Rotation.from_matrix(self.rotation))
+        return np.asarray(slerp(np.clip(wanted, own[0], own[-1])).as_matrix())
+
+
+def track_of_solution(solution: Solution) -> Track:
+    """The states of a solution that a reference can speak of."""
+    chosen = np.r_[ROT, POS, VEL]
+    return Track(
+        t_ns=solution.t_ns,
+        position=solution.nav_t_body,
+        rotation=solution.nav_R_body,
+        velocity=solution.nav_v_body,
+        covariance=solution.covariance[:, chosen[:, None], chosen],
+    )
+
+
+def track_of_reference(reference: Reference, offset_ns: int) -> Track:
+    """The reference on the solution's clock: its stamp t speaks of solution time t + offset."""
+    rotation = None
+    if reference.quat is not None:
+        norm = np.linalg.norm(reference.quat, axis=1)
+        if (norm < 1e-6).any():
+            row = int(np.argmin(norm))
+            raise SessionError("reference", f"qw..qz are all zero at row {row}", "unit quaternions", row=row)
+        rotation = Rotation.from_quat(reference.quat[:, [1, 2, 3, 0]]).as_matrix()
+    return Track(
+        t_ns=reference.t_ns + offset_ns,
+        position=reference.enu,
+        rotation=rotation,
+        velocity=reference.velocity,
+        sigma=reference.sigma,
+    )
+
+
+def check_overlap(estimate: Track, truth: Track, t0_ns: int, offset_s: float) -> None:
+    """Raise unless some reference stamps lie inside the run.
+
+    Raises
+    ------
+    SessionError
+        Either is empty, or the spans have no reference stamp in common; names both spans in seconds since time zero.
+    """
+    for name, track in (("solution", estimate), ("reference", truth)):
+        if not len(track):
+            raise SessionError(name, "has no rows", "at least one epoch", "check the file")
+    if truth.inside(estimate).any():
+        return
+
+    def span(track: Track) -> str:
+        first, last = seconds_since(track.t_ns[[0, -1]], t0_ns)
+        return f"{first:.3f} to {last:.3f} s"
+
+    raise SessionError(
+        "reference",
+        f"spans {span(truth)} after time zero (time offset {offset_s:g} s included), the solution {span(estimate)}",
+        "reference stamps inside the run",
+        "give the shift between the two clocks with --time-offset SECONDS, or --time-offset auto",
+    )
+
+
+def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
+    """Alignment of positions (n, 3) that minimises sum |p_ref - (scale R p_est + t)|^2.
+
+    ``yaw`` turns about the vertical only: psi = atan2(sum x_e y_n - x_n y_e, sum x_e y_e + x_n y_n) over centred
+    horizontal positions x (estimate) and y (reference). ``se3`` and ``sim3`` follow Umeyama (1991, IEEE PAMI 13,
+    376-380) as implemented in evo.
+
+    Raises
+    ------
+    SessionError
+        Unknown method, or positions that do not determine the rotation (standing still, or along a line).
+    """
+    if method == "none":
+        return Alignment(np.eye(3), np.zeros(3))
+    if method == "yaw":
+        return _fit_yaw(estimate, truth)
+    if method not in METHODS:
+        raise SessionError("--align", f"{method!r}", f"one of {', '.join(METHODS)}")
+    from evo.core.geometry import GeometryException, umeyama_alignment
+
+    try:
+        R, t, scale = umeyama_alignment(estimate.T, truth.T, with_scale=method == "sim3")
+    except GeometryException as error:
+        raise _degenerate(method, len(truth), "positions that span a plane") from error
+    return Alignment(np.asarray(R), np.asarray(t), float(scale))
+
+
+def _fit_yaw(estimate: Floats, truth: Floats) -> Alignment:
+    centre, target = estimate.mean(axis=0), truth.mean(axis=0)
+    x, y = estimate - centre, truth - target
+    sine = float((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum())
+    cosine = float((x[:, :2] * y[:, :2]).sum())
+    if np.hypot(sine, cosine) < 1e-12 * len(x):
+        raise _degenerate("yaw", len(truth), "two different places at least")
+    R = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()
+    return Alignment(R, target - R @ centre)
+
+
+def _degenerate(method: str, count: int, rule: str) -> SessionError:
+    return SessionError(
+        f"--align {method}",
+        f"{count} associated positions do not determine the rotation",
+        rule,
+        "use --align none, or a reference in which the device moves",
+    )
+
+
+def find_time_offset(solution: Solution, reference: Reference, method: str) -> float:
+    """Seconds to add to the reference's stamps so that it agrees best with the solution.
+
+    1. Coarse: normalised cross-correlation of the two speeds on a common grid, at every lag that keeps half of the
+       shorter span in common. The best peaks are candidates, and so is 0 where the spans overlap as they are.
+    2. Fine: around each candidate the RMS position difference after `method` alignment is minimised over the offset
+       (bounded scalar search, 0.1 ms). The candidate with the smallest RMS wins.
+
+    Clocks may differ by any amount. A run at constant speed leaves only candidate 0.
+
+    Raises
+    ------
+    SessionError
+        No candidate: the speeds tell nothing and the spans do not overlap.
+    """
+    estimate, truth = track_of_solution(solution), track_of_reference(reference, 0)
+    step_s = _grid_step(estimate, truth)
+    results = []
+    for coarse in _candidates(estimate, truth, step_s):
+        cost = _cost(estimate, truth, method, coarse, step_s)
+        if cost is not None:
+            best = minimize_scalar(cost, bounds=(-step_s, step_s), method="bounded", options={"xatol": 1e-4})
+            results.append((float(best.fun), coarse + float(best.x)))
+    if not results:
+        check_overlap(estimate, truth, solution.t0_ns, 0.0)
+        raise SessionError("--time-offset auto", "no offset can be told from this run", remedy="give it in seconds")
+    return min(results)[1]
+
+
+def _grid_step(estimate: Track, truth: Track) -> float:
+    periods = [float(np.median(np.diff(track.t_ns))) / NS for track in (estimate, truth) if len(track) > 1]
+    return float(np.clip(max(periods, default=0.1), 0.05, 1.0))
+
+
+def _speed(track: Track, step_s: float) -> Floats:
+    grid = track.t_ns[0] + np.arange(0, track.t_ns[-1] - track.t_ns[0], round(step_s * NS))
+    position = interpolate(grid, track.t_ns, track.position)
+    return np.asarray(np.linalg.norm(np.diff(position, axis=0), axis=1) / step_s)
+
+
+def _candidates(estimate: Track, truth: Track, step_s: float) -> list[float]:
+    out = [0.0] if truth.inside(estimate).any() else []
+    a, b = _speed(estimate, step_s), _speed(truth, step_s)
+    if min(len(a), len(b)) < 4:
+        return out
+    correlation, lags = _correlate(a, b)
+    peak = np.flatnonzero((correlation >= np.roll(correlation, 1)) & (correlation >= np.roll(correlation, -1)))
+    best = peak[np.argsort(-correlation[peak], kind="stable")][:_CANDIDATES]
+    start = float(estimate.t_ns[0] - truth.t_ns[0]) / NS
+    return out + [start + step_s * float(lags[i]) for i in best if correlation[i] > 0.0]
+
+
+def _correlate(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Pearson correlation of a[i + lag] with b[i] over their overlap; 0 where nothing varies."""
+    from scipy.signal import correlate, correlation_lags
+
+    ones_a, ones_b = np.ones_like(a), np.ones_like(b)
+
+    def total(x: Floats, y: Floats) -> Floats:
+        return np.asarray(correlate(x, y, method="fft"))
+
+    n = np.maximum(np.rint(total(ones_a, ones_b)), 1.0)
+    mean_a, mean_b = total(a, ones_b) / n, total(ones_a, b) / n
+    variance = (total(a**2, ones_b) / n - mean_a**2) * (total(ones_a, b**2) / n - mean_b**2)
+    covariance = total(a, b) / n - mean_a * mean_b
+    usable = (n >= 0.5 * min(len(a), len(b))) & (variance > 1e-12)
+    lags = np.asarray(correlation_lags(len(a), len(b)), dtype=np.int64)
+    return np.where(usable, covariance / np.sqrt(np.where(usable, variance, 1.0)), 0.0), lags
+
+
+def _cost(
+    estimate: Track, truth: Track, method: str, coarse_s: float, reach_s: float
+) -> Callable[[float], float] | None:
+    """RMS position difference as a function of seconds beside `coarse_s`, over rows inside the run for all of them."""
+    t_ns, reach = truth.t_ns + round(coarse_s * NS), round(reach_s * NS)
+    rows = np.flatnonzero((t_ns - reach >= estimate.t_ns[0]) & (t_ns + reach <= estimate.t_ns[-1]))
+    if len(rows) < 3:
+        return None
+    rows = rows[:: -(-len(rows) // _SEARCH_ROWS)]
+    target, stamps = truth.position[rows], t_ns[rows]
+
+    def rms(extra_s: float) -> float:
+        position = interpolate(stamps + round(extra_s * NS), estimate.t_ns, estimate.position)
+        difference = fit(method, position, target).position(position) - target
+        return float(np.sqrt((difference**2).sum(axis=1).mean()))
+
+    return rms

@@ -1,0 +1,52 @@
+"""Is the covariance honest? Normalised estimation error squared and its chi-square bounds.
+
+Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 5.4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+Floats = NDArray[np.float64]
+
+
+def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
+    """Normalised estimation error squared, e^T P^-1 e, of every row.
+
+    Expected value k (the dimension) where the covariance is honest; above it is over-confident.
+
+    Parameters
+    ----------
+    errors : (n, k)
+    covariances : (n, k, k), same units squared
+
+    Returns
+    -------
+    (n,) dimensionless; NaN where the covariance is not finite or not positive definite.
+    """
+    e = np.asarray(errors, dtype=np.float64)
+    P = np.asarray(covariances, dtype=np.float64)
+    out = np.full(len(e), np.nan)
+    good: NDArray[np.bool_] = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    # eigvalsh tells indefinite matrices apart without raising for the whole stack, as a Cholesky would
+    good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
+    out[good] = np.einsum("ni,ni->n", e[good], np.linalg.solve(P[good], e[good][:, :, None])[:, :, 0])
+    return out
+
+
+def chi2_bounds(dof: int, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided interval that one NEES of `dof` degrees of freedom lies in with `probability`."""
+    tail = 0.5 * (1.0 - probability)
+    return float(chi2.ppf(tail, dof)), float(chi2.ppf(1.0 - tail, dof))
+
+
+def average_nees_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided interval for the mean of `samples` independent NEES values of `dof` degrees of freedom.
+
+    samples * mean ~ chi2(samples * dof). Successive epochs of one smoothed trajectory are not independent:
+    the bounds hold across runs, and are too narrow along one run.
+    """
+    low, high = chi2_bounds(dof * samples, probability)
+    return low / samples, high / samples

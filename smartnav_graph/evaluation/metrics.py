@@ -1,0 +1,280 @@
+"""Accuracy of a solution against a reference: absolute and relative errors, percentiles, consistency.
+
+Definitions: Sturm et al. (2012), A Benchmark for the Evaluation of RGB-D SLAM Systems, section IV (APE, RPE).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.evaluation.align import (
+    METHODS,
+    Alignment,
+    Track,
+    check_overlap,
+    find_time_offset,
+    fit,
+    track_of_reference,
+    track_of_solution,
+)
+from smartnav_graph.evaluation.consistency import nees
+from smartnav_graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.streams import Reference
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Root mean square, mean, percentiles (linear between ranks) and maximum of error magnitudes."""
+
+    rmse: float
+    mean: float
+    p50: float
+    p67: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, magnitudes: ArrayLike) -> Statistics:
+        """Of magnitudes (n,), n >= 1."""
+        x = np.asarray(magnitudes, dtype=np.float64)
+        p50, p67, p95 = (float(p) for p in np.percentile(x, [50, 67, 95]))
+        return cls(float(np.sqrt((x**2).mean())), float(x.mean()), p50, p67, p95, float(x.max()))
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """RMS error of the motion over `delta_s` seconds; None without a pair so far apart, or without attitude."""
+
+    delta_s: float
+    translation_m: float | None
+    rotation_deg: float | None
+    pairs: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How a solution agrees with a reference.
+
+    `nees` are averages, expected 3 for position, velocity and attitude and 1 for yaw; None where the covariance or
+    the reference does not allow them, `notes` say why. Per epoch, errors are solution minus reference after
+    alignment: `t_ns` (n,) on the solution's clock, `error_enu_m` (n, 3), `rotation_error_deg` (n,) geodesic or None,
+    `sigma_enu` (n, 3) m of the solution.
+    """
+
+    solution: str
+    reference: str
+    align: str
+    time_offset_s: float
+    matched: int
+    unmatched: int
+    ape_m: Statistics
+    rotation_deg: Statistics | None
+    rpe: tuple[RelativeError, ...]
+    nees: dict[str, float | None]
+    alignment: Alignment
+    t_ns: NDArray[np.int64]
+    error_enu_m: Floats
+    rotation_error_deg: Floats | None
+    sigma_enu: Floats
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as ``smartnav evaluate --json`` prints them."""
+        return {
+            "solution": self.solution,
+            "reference": self.reference,
+            "align": self.align,
+            "time_offset_s": self.time_offset_s,
+            "matched": self.matched,
+            "unmatched": self.unmatched,
+            "ape_m": asdict(self.ape_m),
+            "rotation_deg": None if self.rotation_deg is None else asdict(self.rotation_deg),
+            "rpe": [
+                {"delta_s": r.delta_s, "translation_m": r.translation_m, "rotation_deg": r.rotation_deg}
+                for r in self.rpe
+            ],
+            "nees": dict(self.nees),
+        }
+
+
+def evaluate(
+    solution: Solution,
+    reference: Reference,
+    *,
+    align: str = "none",
+    time_offset_s: float | Literal["auto"] = 0.0,
+    rpe_deltas_s: Sequence[float] = (1.0, 5.0, 10.0),
+    solution_name: str = "smoothed",
+    reference_name: str = "reference",
+) -> Evaluation:
+    """Compare a solution with a reference.
+
+    The solution is interpolated (linear, attitude by slerp) to each reference stamp inside the run, then aligned.
+
+    Parameters
+    ----------
+    align : ``none``, ``yaw`` (vertical rotation and translation), ``se3`` or ``sim3``
+    time_offset_s : a reference stamp t speaks of solution time t + offset; ``auto`` finds it (`find_time_offset`)
+    rpe_deltas_s : seconds between the ends of the motions whose error is told
+    solution_name, reference_name : what to call them in the result
+
+    Raises
+    ------
+    SessionError
+        No reference stamp lies inside the run; unknown alignment, or one the positions do not determine.
+
+    Notes
+    -----
+    APE = |p_est - p_ref| after alignment; rotation = geodesic angle of R_ref^T R_est. RPE over pairs i, j with
+    |t_j - t_i - delta| <= half a reference period: with attitude, translation and angle of
+    (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) (Sturm et al. 2012); without, the difference of the two displacements.
+    NEES: see `_consistency`. An alignment fitted to the reference makes every NEES a little too small.
+    """
+    if align not in METHODS:
+        raise SessionError("--align", f"{align!r}", f"one of {', '.join(METHODS)}")
+    offset_s = find_time_offset(solution, reference, align) if time_offset_s == "auto" else float(time_offset_s)
+    estimate, whole = track_of_solution(solution), track_of_reference(reference, round(offset_s * NS))
+    check_overlap(estimate, whole, solution.t0_ns, offset_s)
+
+    truth = whole.take(whole.inside(estimate))
+    raw = estimate.at(truth.t_ns)
+    alignment = fit(align, raw.position, truth.position)
+    matched = aligned(raw, alignment)
+    error = matched.position - truth.position
+    angle = rotation_error_deg(matched, truth)
+    averages, notes = _consistency(aligned(estimate, alignment), whole)
+    assert matched.covariance is not None
+    return Evaluation(
+        solution=solution_name,
+        reference=reference_name,
+        align=align,
+        time_offset_s=offset_s,
+        matched=len(truth),
+        unmatched=len(whole) - len(truth),
+        ape_m=Statistics.of(np.linalg.norm(error, axis=1)),
+        rotation_deg=None if angle is None else Statistics.of(angle),
+        rpe=tuple(relative_error(matched, truth, delta) for delta in rpe_deltas_s),
+        nees=averages,
+        alignment=alignment,
+        t_ns=truth.t_ns,
+        error_enu_m=error,
+        rotation_error_deg=angle,
+        sigma_enu=np.sqrt(np.clip(np.diagonal(matched.covariance, axis1=1, axis2=2)[:, POS], 0.0, None)),
+        notes=notes,
+    )
+
+
+def aligned(track: Track, alignment: Alignment) -> Track:
+    """A solution's states, with covariances, after an alignment."""
+    assert track.rotation is not None and track.velocity is not None and track.covariance is not None
+    scale = np.repeat([1.0, alignment.scale, alignment.scale], 3)
+    J = scale[:, None] * np.kron(np.eye(3), alignment.R)
+    return Track(
+        t_ns=track.t_ns,
+        position=alignment.position(track.position),
+        rotation=alignment.rotation(track.rotation),
+        velocity=alignment.vector(track.velocity),
+        covariance=J @ track.covariance @ J.T,
+    )
+
+
+def rotation_error_deg(estimate: Track, truth: Track) -> Floats | None:
+    """Geodesic angle (n,) between the attitudes; None where one has none."""
+    if estimate.rotation is None or truth.rotation is None:
+        return None
+    return np.asarray(np.degrees(np.linalg.norm(_rotation_error(estimate.rotation, truth.rotation), axis=1)))
+
+
+def _rotation_error(estimate: Floats, truth: Floats) -> Floats:
+    """Rotation vectors (n, 3) rad, nav axes: R_ref = Exp(theta) R_est."""
+    return np.asarray(Rotation.from_matrix(truth @ estimate.transpose(0, 2, 1)).as_rotvec())
+
+
+def relative_error(estimate: Track, truth: Track, delta_s: float) -> RelativeError:
+    """Error of the motion over `delta_s`, RMS over all pairs that far apart, half a period more or less."""
+    i, j = _pairs(truth.t_ns, delta_s)
+    if not len(i):
+        return RelativeError(delta_s, None, None, 0)
+    moved, expected = (track.position[j] - track.position[i] for track in (estimate, truth))
+    if estimate.rotation is None or truth.rotation is None:
+        return RelativeError(delta_s, _rms(moved - expected), None, len(i))
+    R, Q = estimate.rotation, truth.rotation
+    difference = np.einsum("nji,nj->ni", R[i], moved) - np.einsum("nji,nj->ni", Q[i], expected)
+    turn = _rotation_error(R[i].transpose(0, 2, 1) @ R[j], Q[i].transpose(0, 2, 1) @ Q[j])
+    return RelativeError(delta_s, _rms(difference), float(np.degrees(_rms(turn))), len(i))
+
+
+def _rms(vectors: Floats) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+def _pairs(t_ns: NDArray[np.int64], delta_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices i < j of all pairs `delta_s` +- half a median period apart."""
+    if len(t_ns) < 2:
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    delta, half = round(delta_s * NS), int(np.median(np.diff(t_ns))) // 2
+    first = np.searchsorted(t_ns, t_ns + delta - half, side="left")
+    first = np.maximum(first, np.arange(len(t_ns)) + 1)
+    last = np.maximum(np.searchsorted(t_ns, t_ns + delta + half, side="right"), first)
+    count = last - first
+    i = np.repeat(np.arange(len(t_ns)), count)
+    j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+    return i, j
+
+
+def _consistency(estimate: Track, truth: Track) -> tuple[dict[str, float | None], tuple[str, ...]]:
+    """Average NEES of position, velocity, attitude, yaw.
+
+    Compared at the epochs of whichever is sparser, the denser one interpolated: a linear interpolation over 1 s
+    between keyframes errs by more than a good solution's sigma. Rows inside a hole of the reference are left out.
+    Where the reference tells its own sigmas they join the covariance of the position.
+    """
+    estimate, truth = _at_common_epochs(estimate, truth)
+    if not len(truth):
+        return dict.fromkeys(("position", "velocity", "attitude", "yaw")), ("nees: no epoch of the run in reference",)
+    P = estimate.covariance
+    assert P is not None and estimate.rotation is not None and estimate.velocity is not None
+    position = P[:, POS, POS]
+    if truth.sigma is not None:
+        position = position + np.nan_to_num(truth.sigma)[:, :, None] ** 2 * np.eye(3)
+    checks = {"position": (estimate.position - truth.position, position)}
+    if truth.velocity is not None:
+        checks["velocity"] = (estimate.velocity - truth.velocity, P[:, VEL, VEL])
+    if truth.rotation is not None:
+        theta = _rotation_error(estimate.rotation, truth.rotation)
+        checks["attitude"] = (theta, P[:, ROT, ROT])
+        checks["yaw"] = (theta[:, 2:], P[:, 2:3, 2:3])
+    averages: dict[str, float | None] = {}
+    notes: list[str] = []
+    for name in ("position", "velocity", "attitude", "yaw"):
+        averages[name] = None
+        if name not in checks:
+            notes.append(f"nees {name}: the reference has no {'velocity' if name == 'velocity' else 'attitude'}")
+            continue
+        values = nees(*checks[name])
+        bad = int((~np.isfinite(values)).sum())
+        if bad:
+            notes.append(f"nees {name}: covariance not positive definite at {bad} of {len(values)} epochs")
+        else:
+            averages[name] = float(values.mean())
+    return averages, tuple(notes)
+
+
+def _at_common_epochs(estimate: Track, truth: Track) -> tuple[Track, Track]:
+    inside, covered = truth.take(truth.inside(estimate)), estimate.take(estimate.inside(truth))
+    if len(inside) <= len(covered):
+        return estimate.at(inside.t_ns), inside
+    after = np.clip(np.searchsorted(truth.t_ns, covered.t_ns), 1, len(truth) - 1)
+    step = np.diff(truth.t_ns)
+    covered = covered.take(step[after - 1] <= 3 * np.median(step))
+    return covered, truth.at(covered.t_ns)

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from planted_run import T0, make_reference, make_solution
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.evaluation import evaluate
+from smartnav_graph.evaluation.align import fit, track_of_solution
+from smartnav_graph.timebase import NS
+
+
+def moved(solution, R, t, scale=1.0):
+    """The solution as told in another frame, so that p_ref = scale R p_est + t."""
+    return dataclasses.replace(
+        solution,
+        nav_t_body=(solution.nav_t_body - t) @ R / scale,
+        nav_v_body=solution.nav_v_body @ R / scale,
+        nav_R_body=R.T @ solution.nav_R_body,
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "R", "scale"),
+    [
+        ("yaw", Rotation.from_euler("z", 170.0, degrees=True), 1.0),
+        ("yaw", Rotation.from_euler("z", -180.0, degrees=True), 1.0),
+        ("se3", Rotation.from_euler("ZYX", [100.0, 20.0, -50.0], degrees=True), 1.0),
+        ("sim3", Rotation.from_euler("ZYX", [100.0, 20.0, -50.0], degrees=True), 1.7),
+    ],
+)
+def test_planted_alignment_is_recovered(seconds, method, R, scale):
+    R, t = R.as_matrix(), np.array([100.0, -2000.0, 30.0])
+    result = evaluate(moved(make_solution(seconds), R, t, scale), make_reference(seconds), align=method)
+    assert np.abs(result.alignment.R - R).max() < 1e-9
+    assert np.abs(result.alignment.t - t).max() < 1e-9 * 2000 * scale  # m, at 2 km from the origin
+    assert result.alignment.scale == pytest.approx(scale, abs=1e-9)
+    assert result.ape_m.max < 1e-9 * 2000
+    assert result.rotation_deg.max < 1e-6
+
+
+def test_yaw_leaves_tilt_alone(seconds):
+    R = Rotation.from_euler("x", 5.0, degrees=True).as_matrix()
+    result = evaluate(moved(make_solution(seconds), R, np.zeros(3)), make_reference(seconds), align="yaw")
+    assert result.rotation_deg.mean > 4.0
+    assert result.alignment.R[2] == pytest.approx([0.0, 0.0, 1.0])
+
+
+def test_alignment_turns_the_covariance_too(seconds):
+    R = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    P = np.diag(np.r_[np.ones(3), 9.0, 1.0, 4.0, np.ones(9)])
+    result = evaluate(moved(make_solution(seconds, P), R, np.zeros(3)), make_reference(seconds), align="yaw")
+    assert result.sigma_enu[10] == pytest.approx([1.0, 3.0, 2.0])
+
+
+def test_interpolation_is_linear_and_slerp():
+    solution = make_solution(np.array([0.0, 1.0]))
+    R0 = solution.nav_R_body[0]
+    R1 = R0 @ Rotation.from_rotvec([0.0, 0.0, np.radians(100.0)]).as_matrix()
+    solution = dataclasses.replace(solution, nav_R_body=np.stack([R0, R1]))
+    between = track_of_solution(solution).at(np.array([T0 + NS // 4]))
+    assert between.position[0] == pytest.approx(0.75 * solution.nav_t_body[0] + 0.25 * solution.nav_t_body[1])
+    turned = Rotation.from_matrix(R0.T @ between.rotation[0]).as_rotvec(degrees=True)
+    assert turned == pytest.approx([0.0, 0.0, 25.0])
+
+
+@pytest.mark.parametrize("planted", [0.0, 0.237, -1.418, 3600.5, -1.7e9])
+@pytest.mark.parametrize("align", ["none", "yaw"])
+def test_planted_time_offset_is_found(seconds, planted, align):
+    reference = make_reference(np.arange(5.0, 55.0, 0.05))
+    early = dataclasses.replace(reference, t_ns=reference.t_ns - round(planted * NS))
+    result = evaluate(make_solution(seconds), early, align=align, time_offset_s="auto")
+    assert result.time_offset_s == pytest.approx(planted, abs=0.005)  # s
+    assert result.ape_m.rmse < 0.02
+
+
+def test_time_offset_sign(seconds):
+    reference = make_reference(seconds)
+    late = dataclasses.replace(reference, t_ns=reference.t_ns + 2 * NS)
+    assert evaluate(make_solution(seconds), late, time_offset_s=-2.0).ape_m.max < 1e-9
+    assert evaluate(make_solution(seconds), late).ape_m.rmse > 5.0
+
+
+def test_spans_that_do_not_meet_are_named(seconds):
+    reference = make_reference(seconds)
+    late = dataclasses.replace(reference, t_ns=reference.t_ns + 1000 * NS)
+    with pytest.raises(SessionError, match=r"spans 1000\.000 to 1059\.900 s.*solution 0\.000 to 59\.900 s.*--time-off"):
+        evaluate(make_solution(seconds), late)
+
+
+def test_a_still_reference_cannot_be_aligned(seconds):
+    reference = make_reference(seconds)
+    still = dataclasses.replace(reference, enu=np.zeros_like(reference.enu))
+    for method in ("yaw", "se3", "sim3"):
+        with pytest.raises(SessionError, match=f"--align {method}.*do not determine the rotation"):
+            evaluate(make_solution(seconds), still, align=method)
+
+
+def test_unknown_method_is_refused(seconds):
+    with pytest.raises(SessionError, match="one of none, yaw, se3, sim3"):
+        evaluate(make_solution(seconds), make_reference(seconds), align="se2")
+
+
+def test_fit_agrees_with_a_numerical_minimum():
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    found = fit("yaw", a, b)
+
+    def cost(psi):
+        R = Rotation.from_euler("z", psi).as_matrix()
+        d = (b - b.mean(0)) - (a - a.mean(0)) @ R.T
+        return (d**2).sum()
+
+    grid = np.linspace(-np.pi, np.pi, 3601)
+    best = grid[np.argmin([cost(psi) for psi in grid])]
+    psi = np.arctan2(found.R[1, 0], found.R[0, 0])
+    assert psi == pytest.approx(best, abs=2e-3)
