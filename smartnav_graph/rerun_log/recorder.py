@@ -1,0 +1,148 @@
+"""One open recording: the time lines every row carries, and which entities hold data."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Times = NDArray[np.int64]
+
+APPLICATION = "smartnav_graph"
+
+# Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
+_LEAP_DAYS = (
+    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
+    *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
+    *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+)
+_GPS_EPOCH_NS = int(np.datetime64("1980-01-06", "ns").astype(np.int64))
+_YEAR_2000_NS = int(np.datetime64("2000-01-01", "ns").astype(np.int64))
+
+
+def utc_from_gps(t_ns: Times) -> Times:
+    """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds taken off."""
+    steps = np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64) + np.arange(1, len(_LEAP_DAYS) + 1) * 10**9
+    continuous = np.asarray(t_ns, dtype=np.int64) + _GPS_EPOCH_NS
+    return np.asarray(continuous - np.searchsorted(steps, continuous, side="right") * 10**9)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Stamps of a session -> the index columns `elapsed`, `utc` or `device`, and `keyframe`.
+
+    `elapsed` counts from the session's time zero. `utc` exists where the session's clock is a date (unix, gps), else
+    `device` holds the raw reading. A "gps" or "unix" clock that reads before the year 2000 counts seconds of a week
+    or a day: it is no date.
+    """
+
+    t0_ns: int
+    epoch: str = "unknown"
+
+    @property
+    def is_date(self) -> bool:
+        return self.epoch in ("unix", "gps") and int(self._utc(np.array([self.t0_ns]))[0]) >= _YEAR_2000_NS
+
+    def _utc(self, t_ns: Times) -> Times:
+        return utc_from_gps(t_ns) if self.epoch == "gps" else t_ns
+
+    def columns(self, t_ns: ArrayLike, keyframe: ArrayLike | None = None) -> list[Any]:
+        """Index columns for rows at `t_ns` (n,)."""
+        import rerun as rr
+
+        t = np.asarray(t_ns, dtype=np.int64)
+        columns = [rr.TimeColumn("elapsed", duration=(t - self.t0_ns).astype("timedelta64[ns]"))]
+        if self.is_date:
+            columns.append(rr.TimeColumn("utc", timestamp=self._utc(t).astype("datetime64[ns]")))
+        else:
+            columns.append(rr.TimeColumn("device", duration=t.astype("timedelta64[ns]")))
+        if keyframe is not None:
+            columns.append(rr.TimeColumn("keyframe", sequence=np.asarray(keyframe, dtype=np.int64)))
+        return columns
+
+
+@dataclass
+class Recorder:
+    """Writes columns and static data, and remembers the entities, so that the blueprint shows only what is there."""
+
+    stream: Any
+    clock: Clock
+    paths: set[str] = field(default_factory=set)
+
+    def static(self, path: str, *archetypes: Any) -> None:
+        """Data that holds at all times."""
+        self.stream.log(path, *archetypes, static=True, strict=True)
+        self.paths.add(path)
+
+    def style(self, path: str, archetype: Any) -> None:
+        """Static colours and names of an entity whose data are rows."""
+        self.stream.log(path, archetype, static=True, strict=True)
+
+    def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[Any], keyframe: ArrayLike | None = None) -> None:
+        """One row a time stamp; nothing is written without rows."""
+        if len(np.asarray(t_ns)):
+            self.stream.send_columns(path, self.clock.columns(t_ns, keyframe), columns, strict=True)
+            self.paths.add(path)
+
+    def clear(self, path: str, t_ns: ArrayLike) -> None:
+        """End what an entity shows at these times: a stream that stops must not be joined by a line."""
+        import rerun as rr
+
+        t = np.asarray(t_ns, dtype=np.int64)
+        if len(t) and path in self.paths:
+            cleared = rr.Clear.columns(is_recursive=np.zeros(len(t), dtype=bool))
+            self.stream.send_columns(path, self.clock.columns(t), cleared, strict=True)
+
+    def has(self, prefix: str) -> bool:
+        """Whether this entity, or one below it, holds data."""
+        return any(path == prefix or path.startswith(prefix + "/") for path in self.paths)
+
+
+def open_stream(path: Path, recording_id: str) -> Any:
+    """A stream into the file `path` that carries no wall-clock time: the same data give the same recording."""
+    import rerun as rr
+
+    # Every static row its own chunk: the default batches by a wall-clock tick.
+    stream = rr.RecordingStream(
+        APPLICATION,
+        recording_id=recording_id,
+        send_properties=False,
+        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+    )
+    stream.save(path)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def fingerprint(*parts: Any) -> str:
+    """Hexadecimal digest of the numbers and texts in arrays, dataclasses, mappings and sequences."""
+    digest = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        _feed(digest, part)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, part: Any) -> None:
+    if isinstance(part, np.ndarray) and part.dtype != object:
+        digest.update(f"{part.dtype.str}{part.shape}".encode())
+        digest.update(np.ascontiguousarray(part).tobytes())
+    elif is_dataclass(part) and not isinstance(part, type):
+        for spec in fields(part):
+            _feed(digest, spec.name)
+            _feed(digest, getattr(part, spec.name))
+    elif isinstance(part, Mapping):
+        for key, value in part.items():
+            _feed(digest, str(key))
+            _feed(digest, value)
+    elif isinstance(part, list | tuple | np.ndarray):
+        digest.update(f"[{len(part)}]".encode())
+        for item in part:
+            _feed(digest, item)
+    else:
+        digest.update(f"{part!r};".encode())

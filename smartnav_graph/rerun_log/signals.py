@@ -1,0 +1,145 @@
+"""Everything drawn against time: inertial and other signals, biases, sigmas, errors, residuals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.rerun_log import colours
+from smartnav_graph.rerun_log.events import stops
+from smartnav_graph.rerun_log.recorder import Recorder
+from smartnav_graph.session import Session
+from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solution
+
+Floats = NDArray[np.float64]
+
+MARKER_SIZE = 2.0
+EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
+
+
+def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
+    """Raw signals, in body axes and SI units (magnetic field uT, pressure hPa, temperature deg C)."""
+    columns: list[tuple[str, Any, str]] = [
+        ("/imu/accel", session.imu, "accel"),
+        ("/imu/gyro", session.imu, "gyro"),
+        ("/magnetometer", session.magnetometer, "field_ut"),
+        ("/barometer", session.barometer, "pressure_hpa"),
+        ("/temperature", session.temperature, "temperature_c"),
+        ("/velocity", session.velocity, "velocity"),
+        ("/wheel", session.wheel, "speed"),
+    ]
+    for path, stream, quantity in columns:
+        if stream is not None:
+            names = ["x", "y", "z"] if getattr(stream, quantity).ndim == 2 else [quantity]
+            _log_lines(recorder, path, stream.t_ns, getattr(stream, quantity), names)
+            recorder.clear(path, stops(stream.t_ns, end_ns))
+
+
+def _log_lines(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    names: list[str],
+    keyframe: NDArray[Any] | None = None,
+) -> None:
+    import rerun as rr
+
+    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values), keyframe)
+    recorder.style(path, rr.SeriesLines(colors=colours.AXES[: len(names)], names=names, widths=[1.0] * len(names)))
+
+
+def _log_bands(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    sigmas: Floats,
+    names: list[str],
+    unit: str,
+    keyframe: NDArray[Any] | None,
+) -> None:
+    """Three lines with bands of one sigma."""
+    import rerun as rr
+
+    columns = rr.Measurements.columns(values=values, variances=sigmas**2)
+    recorder.rows(path, t_ns, columns, keyframe)
+    style = rr.Measurements.from_fields(names=names, units=[unit] * len(names), colors=colours.AXES[: len(names)])
+    recorder.style(path, style)
+
+
+def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -> None:
+    """Biases with their bands; the error with its band where a reference is known, else the sigma itself."""
+    sigma, t, rows = solution.sigmas, solution.t_ns, np.arange(len(solution))
+    axes = ["x", "y", "z"]
+    _log_bands(recorder, "/bias/accel", t, solution.accel_bias, sigma[:, ACCEL_BIAS], axes, "m/s²", rows)
+    _log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s", rows)
+    _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"], rows)
+    _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg, ["heading"], rows)
+    if evaluation is not None:
+        _log_error(recorder, evaluation)
+
+
+def _log_error(recorder: Recorder, evaluation: Any) -> None:
+    t, error = np.asarray(evaluation.t_ns), np.asarray(evaluation.error_enu_m)
+    sigma, names = getattr(evaluation, "sigma_enu", None), ["east", "north", "up"]
+    if sigma is None:
+        _log_lines(recorder, "/error/position", t, error, names)
+    else:
+        _log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m", None)
+    rotation = getattr(evaluation, "rotation_error_deg", None)
+    if rotation is not None and np.isfinite(rotation).any():
+        _log_lines(recorder, "/error/rotation", t, np.asarray(rotation), ["rotation"])
+
+
+def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:
+    """Times (n,) and whitened residuals (n, axes) of one sensor; NaN where an axis has none.
+
+    Several residuals of one axis at one time (many matches of an image pair) become rows with the same time.
+    """
+    chosen = residuals.of(sensor)
+    width = int(residuals.axis[chosen].max()) + 1
+    rows = np.flatnonzero(chosen & (residuals.used == used))
+    if not len(rows):
+        return np.zeros(0, dtype=np.int64), np.zeros((0, width))
+    order = rows[np.lexsort((residuals.axis[rows], residuals.t_ns[rows]))]
+    t, axis = residuals.t_ns[order], residuals.axis[order]
+    new = np.concatenate([[True], (np.diff(t) != 0) | (np.diff(axis) != 0)])
+    place = np.arange(len(order))
+    repeat = place - np.maximum.accumulate(np.where(new, place, 0))
+    keys, row = np.unique(np.stack([t, repeat], axis=1), axis=0, return_inverse=True)
+    table = np.full((len(keys), width), np.nan)
+    table[row.ravel(), axis] = residuals.whitened[order]
+    return keys[:, 0], table
+
+
+def sensors_of(residuals: Residuals) -> list[str]:
+    """Names of the sensors with residuals, sorted."""
+    return sorted({str(name) for name in residuals.sensor})
+
+
+def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
+    """Whitened residuals a sensor: /residuals/<sensor>, and what was not used at /residuals/<sensor>/rejected."""
+    import rerun as rr
+
+    for sensor in sensors_of(residuals):
+        for path, used in ((f"/residuals/{sensor}", True), (f"/residuals/{sensor}/rejected", False)):
+            t, table = residual_rows(residuals, sensor, used)
+            width = table.shape[1]
+            names = [f"{axis_name(k, width)}{'' if used else ' rejected'}" for k in range(width)]
+            recorder.rows(path, t, rr.Scalars.columns(scalars=table))
+            if len(t):
+                style = rr.SeriesPoints(
+                    colors=[colours.AXES[k % 3] if used else colours.REJECTED for k in range(width)],
+                    names=names,
+                    markers=["circle" if used else "cross"] * width,
+                    marker_sizes=[MARKER_SIZE if used else 2.5 * MARKER_SIZE] * width,
+                )
+                recorder.style(path, style)
+
+
+def axis_name(axis: int, width: int) -> str:
+    """East, north, up of a position; the axis number of anything else."""
+    return ("east", "north", "up")[axis] if width == 3 else f"axis {axis}"

@@ -1,0 +1,134 @@
+"""States along time and the log: gaps, outages, standstills, rejections, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.rerun_log import colours
+from smartnav_graph.rerun_log.events import REJECTED, WITHHELD, Events, switches
+from smartnav_graph.rerun_log.recorder import Recorder
+from smartnav_graph.session import Session
+from smartnav_graph.timebase import Gap, seconds_since
+
+MOST_LINES_A_KIND = 200
+
+GOOD, POOR, BAD = [60, 140, 80], [220, 150, 40], [210, 60, 60]
+_STATES = {
+    "recorded": GOOD,
+    "missing": BAD,
+    "bridged": POOR,
+    "fix": GOOD,
+    "outage": BAD,
+    "moving": GOOD,
+    "still": [70, 110, 190],
+    "accepted": GOOD,
+    "rejected": BAD,
+}
+
+Line = tuple[int, str, str]
+
+
+def log_status(recorder: Recorder, session: Session, events: Events) -> None:
+    """What was there when: /status/imu, /status/gnss, /status/gnss_gate, /status/motion."""
+    if session.imu is not None:
+        _log_state(recorder, "/status/imu", events, events.gaps, "recorded")
+    if session.gnss is not None:
+        _log_state(recorder, "/status/gnss", events, events.outages, "fix")
+        rejections = _rejections(session, events)
+        if rejections:
+            _log_state(recorder, "/status/gnss_gate", events, rejections, "accepted")
+    if events.standstills:
+        _log_state(recorder, "/status/motion", events, events.standstills, "moving")
+
+
+def _rejections(session: Session, events: Events) -> list[Gap]:
+    """From each rejected fix to the next fix."""
+    assert session.gnss is not None
+    t = np.concatenate([session.gnss.t_ns, [max(events.end_ns, int(session.gnss.t_ns[-1]))]])
+    return [Gap(int(t[i]), int(t[i + 1]), "rejected") for i in np.flatnonzero(events.fix_use == REJECTED)]
+
+
+def _log_state(recorder: Recorder, path: str, events: Events, spans: list[Gap], between: str) -> None:
+    import rerun as rr
+
+    times, states = switches(events.start_ns, spans, between)
+    recorder.rows(path, times, rr.StateChange.columns(state=states))
+    values = sorted(set(states))
+    colors = [_STATES.get(value, colours.QUIET) for value in values]
+    recorder.style(path, rr.StateConfiguration(values=values, labels=values, colors=colors))
+
+
+def log_lines(
+    recorder: Recorder, session: Session, events: Events, summary: Mapping[str, Any], told: list[str]
+) -> None:
+    """The log at /log: what the session holds, initialisation, warnings, gaps, outages, rejected fixes."""
+    import rerun as rr
+
+    lines = [*_opening(session, events, summary, told), *_happenings(session, events)]
+    lines.sort(key=lambda line: line[0])
+    columns = rr.TextLog.columns(text=[text for _, _, text in lines], level=[level for _, level, _ in lines])
+    recorder.rows("/log", [t for t, _, _ in lines], columns)
+
+
+def _opening(session: Session, events: Events, summary: Mapping[str, Any], told: list[str]) -> list[Line]:
+    start = events.start_ns
+    lines = [
+        (start, "INFO", f"{name}: {len(stream)} rows{_rate(stream)}") for name, stream in session.streams().items()
+    ]
+    for stream, counts in session.dropped.items():
+        lines += [
+            (start, "WARN", f"{stream}: {count} rows dropped or repaired ({why})") for why, count in counts.items()
+        ]
+    if summary.get("initialisation"):
+        lines.append((start, "INFO", f"initialised: {flat(summary['initialisation'])}"))
+    lines += [(start, "WARN", str(text)) for text in summary.get("warnings", ())]
+    return lines + [(start, "INFO", text) for text in told]
+
+
+def _rate(stream: Any) -> str:
+    if len(stream) < 2:
+        return ""
+    step = float(np.median(np.diff(stream.t_ns))) / 1e9
+    return f", {1 / step:.4g} Hz" if step > 0 else ""
+
+
+def flat(value: Any) -> str:
+    """A summary's value on one line."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {flat(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return " ".join(flat(item) for item in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _happenings(session: Session, events: Events) -> list[Line]:
+    kinds: list[list[Line]] = [
+        [(g.start_ns, "WARN", f"imu: {g.kind} for {g.length_s:.2f} s") for g in events.gaps],
+        [(g.start_ns, "WARN", f"gnss: no fix used for {g.length_s:.1f} s") for g in events.outages],
+        [(g.start_ns, "INFO", f"standstill of {g.length_s:.1f} s") for g in events.standstills],
+    ]
+    if session.gnss is not None:
+        for use, level, what in ((REJECTED, "WARN", "fix rejected"), (WITHHELD, "INFO", "fix not in the solution")):
+            times = session.gnss.t_ns[events.fix_use == use]
+            seconds = seconds_since(times, session.t0_ns)
+            kinds.append([(int(t), level, f"gnss: {what} at {s:.2f} s") for t, s in zip(times, seconds, strict=True)])
+    return [line for lines in kinds for line in _capped(lines)]
+
+
+def _capped(lines: list[Line]) -> list[Line]:
+    """At most MOST_LINES_A_KIND of one kind; the last line tells how many more there are."""
+    if len(lines) <= MOST_LINES_A_KIND:
+        return lines
+    t, level, text = lines[MOST_LINES_A_KIND]
+    return [*lines[:MOST_LINES_A_KIND], (t, level, f"{text}; {len(lines) - MOST_LINES_A_KIND - 1} more like this")]
+
+
+def log_report(recorder: Recorder, markdown: str | None) -> None:
+    """The report's text at /report."""
+    import rerun as rr
+
+    if markdown:
+        recorder.static("/report", rr.TextDocument(markdown, media_type="text/markdown"))
