@@ -39,9 +39,12 @@ def ns_from_text(text: str, unit_ns: int = NS) -> int:
     """
     try:
         value = Decimal(text.strip()) * unit_ns
-        return int(value.quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
-    except InvalidOperation as error:
+        ns = int(value.quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
+    except (InvalidOperation, ValueError) as error:  # ValueError: nan
         raise SessionError("time stamp", f"{text!r} is no number", "a decimal number of seconds") from error
+    if abs(ns) >= 2**63:
+        raise SessionError("time stamp", f"{text!r} does not fit int64 nanoseconds", "within 292 years of the epoch")
+    return ns
 
 
 def ns_from_texts(texts: Sequence[str], unit_ns: int = NS) -> Times:

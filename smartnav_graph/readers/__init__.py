@@ -9,11 +9,20 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from smartnav_graph.errors import SessionError
-from smartnav_graph.readers import gtsam_kitti
+from smartnav_graph.readers import comma2k19, csv_folder, euroc, gtsam_euroc, gtsam_kitti
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import Session
 
-READERS: dict[str, Reader] = {reader.name: reader for reader in (gtsam_kitti.READER,)}
+READERS: dict[str, Reader] = {
+    reader.name: reader
+    for reader in (
+        gtsam_kitti.READER,
+        gtsam_euroc.READER,
+        euroc.READER,
+        comma2k19.READER,
+        csv_folder.READER,
+    )
+}
 
 __all__ = ["READERS", "Reader", "find", "read"]
 

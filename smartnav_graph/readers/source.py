@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Session, build_stream
+from smartnav_graph.session import Mount, Session, build_stream
 from smartnav_graph.streams import STREAMS, Stream
 
 Columns = dict[str, NDArray[Any]]
@@ -61,6 +61,13 @@ def vector_columns(template: str, rows: NDArray[np.float64], axes: str = "xyz") 
     return {template.format(axis): column for axis, column in zip(axes, rows.T, strict=True)}
 
 
+def mount(body_t: ArrayLike, body_R: ArrayLike) -> Mount:
+    """A mount of arrays: sensor origin (3,) m and axes (3, 3) in body axes."""
+    x, y, z = (float(value) for value in np.asarray(body_t, dtype=np.float64))
+    rows = tuple((float(a), float(b), float(c)) for a, b, c in np.asarray(body_R, dtype=np.float64))
+    return Mount(body_t=(x, y, z), body_R=rows)
+
+
 def build_session(tables: Mapping[str, tuple[Path, Columns]], repairs: tuple[str, ...], **header: Any) -> Session:
     """A session of file columns: stream name -> (file they came from, columns).
 
@@ -75,7 +82,7 @@ def build_session(tables: Mapping[str, tuple[Path, Columns]], repairs: tuple[str
     streams: dict[str, Stream] = {}
     dropped: dict[str, dict[str, int]] = {}
     for name, (file, columns) in tables.items():
-        if not len(columns["t_ns"]):
+        if "t_ns" in columns and not len(columns["t_ns"]):
             raise SessionError(file, "has no rows", "at least one row", stream=name)
         streams[name], counts = build_stream(STREAMS[name], columns, file, repairs)
         dropped |= {name: counts} if counts else {}

@@ -67,6 +67,11 @@ class TextTable:
                 f"the file has {', '.join(self.cells)}; rename or add the column",
             )
 
+    def where(self, name: str, value: str) -> TextTable:
+        """The rows whose cell in column `name` reads `value`."""
+        mask = pa.compute.equal(self.cells[name], value)
+        return TextTable(self.path, {column: cells.filter(mask) for column, cells in self.cells.items()})
+
     def texts(self, name: str) -> NDArray[Any]:
         """Cells as text (object array); empty where empty."""
         return np.array(self.cells[name].to_pylist(), dtype=object)
@@ -80,7 +85,7 @@ class TextTable:
         """One column as int64; every cell must hold a whole number."""
         numbers = self._numbers(name, pa.int64(), "a whole number")
         if numbers.null_count:
-            raise self._bad_cell(name, int(np.flatnonzero(numbers.is_null())[0]), "a whole number")
+            raise self._bad_cell(name, numbers.is_null().index(True).as_py(), "a whole number")
         return np.asarray(numbers.to_numpy(), dtype=np.int64)
 
     def times(self, name: str, unit_ns: int = NS) -> Times:
@@ -132,9 +137,10 @@ def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
     Parameters
     ----------
     path : the file; UTF-8
-    names : column names, for files without a heading line; by default the first line (a leading # is taken off)
+    names : column names, for files without a heading or with a heading behind #; by default the first line names the
+        columns (a leading # is taken off)
 
-    Lines that start with # after the heading are comments. Row numbers in errors count data rows from zero.
+    Further lines that start with # are comments. Row numbers in errors count data rows from zero.
 
     Raises
     ------

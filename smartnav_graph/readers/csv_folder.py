@@ -1,0 +1,73 @@
+"""A folder of CSV files with the session's own columns: imu.csv, gnss.csv, ... and, if there, session.toml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph import repair
+from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.source import Columns, Reader, build_session
+from smartnav_graph.readers.text import TextTable, read_text
+from smartnav_graph.session import Session, read_header
+from smartnav_graph.streams import STREAMS, Stream
+
+NAME = "csv"
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    return {name: folder / f"{name}.csv" for name in STREAMS if (folder / f"{name}.csv").is_file()}
+
+
+def _read(source: str, repairs: tuple[str, ...]) -> Session:
+    folder = Path(source)
+    files = _files(folder)
+    known = ", ".join(f"{name}.csv" for name in STREAMS)
+    if not files:
+        raise SessionError(folder, "holds no stream", f"some of {known}", "name each file after its stream")
+    for other in sorted(set(folder.glob("*.csv")) - set(files.values())):
+        raise SessionError(other, "is no stream of a session", f"some of {known}", "rename the file or move it away")
+    header: dict[str, Any] = read_header(folder) if (folder / "session.toml").exists() else {}
+    wanted = repair.check_names({*header.pop("repairs", ()), *repairs})
+    tables = {name: (file, _columns(STREAMS[name], read_text(file))) for name, file in files.items()}
+    try:
+        return build_session(tables, wanted, **header)
+    except SessionError as error:
+        raise error.located(files[error.where]) if error.where in files else error from error
+
+
+def _columns(kind: type[Stream], table: TextTable) -> Columns:
+    """Every column by its kind. A wholly empty optional column is one that is not there."""
+    kinds = {name: spec.metadata["kind"] for spec in kind.specs() for name in spec.metadata["columns"]}
+    optional = {name for spec in kind.specs() if spec.default is None for name in spec.metadata["columns"]}
+    columns: Columns = {}
+    for name in table.cells:
+        if name in optional and table.is_empty(name):
+            continue
+        columns[name] = _column(table, name, kinds.get(name))
+    return columns
+
+
+def _column(table: TextTable, name: str, kind: str | None) -> NDArray[Any]:
+    if kind == "int":
+        return table.ints(name)
+    if kind == "float":
+        return table.floats(name)
+    if kind == "text":
+        return table.texts(name)
+    try:
+        return np.asarray(table.floats(name))
+    except SessionError:  # an unknown column is kept as whatever it holds
+        return table.texts(name)
+
+
+READER = Reader(
+    name=NAME,
+    summary="folder of CSV files with the session's own columns",
+    recognised_by="a folder with imu.csv, gnss.csv or another stream's name, and optionally session.toml",
+    matches=lambda source: bool(_files(Path(source))),
+    read_source=_read,
+)

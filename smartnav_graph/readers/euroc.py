@@ -1,0 +1,104 @@
+"""EuRoC / ASL folders: ``imu0/data.csv``, ``cam*/data.csv`` with their ``sensor.yaml``, and the ground truth if there.
+
+Burri et al. (2016), The EuRoC micro aerial vehicle datasets. The body is the IMU: extrinsics T_BS of the cameras are
+taken relative to the IMU's own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.reference import euroc_columns
+from smartnav_graph.readers.source import Columns, Reader, build_session, mount, vector_columns
+from smartnav_graph.readers.text import read_bytes, read_text
+from smartnav_graph.session import Device, Mount, Session
+
+NAME = "euroc"
+GRAVITY = 9.81
+GROUND_TRUTH = Path("state_groundtruth_estimate0", "data.csv")
+
+_T_BS = re.compile(r"^T_BS:.*?data:\s*\[([^\]]*)\]", re.DOTALL | re.MULTILINE)
+
+
+def _root(source: str) -> Path | None:
+    for folder in (Path(source), Path(source) / "mav0"):
+        if (folder / "imu0" / "data.csv").is_file():
+            return folder
+    return None
+
+
+def _read(source: str, repairs: tuple[str, ...]) -> Session:
+    root = _root(source)
+    if root is None:
+        raise SessionError(source, "holds no imu0/data.csv", "an ASL folder (mav0)", "give the folder that holds imu0")
+    imu = root / "imu0" / "data.csv"
+    tables = {"imu": (imu, _imu_columns(imu))}
+    cameras = sorted(file.parent.name for file in root.glob("cam*/data.csv"))
+    if cameras:
+        tables["images"] = (root / cameras[0] / "data.csv", _image_columns(root, cameras))
+    if (root / GROUND_TRUTH).is_file():
+        tables["reference"] = (root / GROUND_TRUTH, euroc_columns(root / GROUND_TRUTH))
+    return build_session(
+        tables,
+        repairs,
+        device=Device(name="EuRoC VI-Sensor ADIS16448", forward="+z", up="+x"),
+        clock_epoch="unix",
+        gravity_m_s2=GRAVITY,
+        sensors=_mounts(root, cameras),
+    )
+
+
+def _imu_columns(path: Path) -> Columns:
+    table = read_text(path, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
+    gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
+    return {"t_ns": table.ints("t")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
+
+
+def _image_columns(root: Path, cameras: list[str]) -> Columns:
+    """One row an image of any camera, by time; file names count from the ASL folder."""
+    t_ns: list[NDArray[np.int64]] = []
+    files: list[str] = []
+    names: list[str] = []
+    for camera in cameras:
+        table = read_text(root / camera / "data.csv", names=("t", "file"))
+        t_ns.append(table.ints("t"))
+        files += [f"{camera}/data/{file}" for file in table.texts("file")]
+        names += [camera] * len(table)
+    times = np.concatenate(t_ns)
+    order = np.argsort(times, kind="stable")
+    return {
+        "t_ns": times[order],
+        "image_id": np.arange(len(times)),
+        "file": np.array(files, dtype=object)[order],
+        "camera": np.array(names, dtype=object)[order],
+    }
+
+
+def _mounts(root: Path, cameras: list[str]) -> Mapping[str, Mount]:
+    imu_T_base = np.linalg.inv(_extrinsics(root / "imu0" / "sensor.yaml"))
+    poses = {camera: imu_T_base @ _extrinsics(root / camera / "sensor.yaml") for camera in cameras}
+    return {camera: mount(pose[:3, 3], pose[:3, :3]) for camera, pose in poses.items()}
+
+
+def _extrinsics(path: Path) -> NDArray[np.float64]:
+    found = _T_BS.search(read_bytes(path).decode("utf-8", errors="replace"))
+    try:
+        numbers = np.array(found[1].split(",") if found else [], dtype=np.float64)
+        return numbers.reshape(4, 4)
+    except ValueError as error:
+        raise SessionError(path, "T_BS is missing or no matrix", "16 numbers under T_BS: data", str(error)) from error
+
+
+READER = Reader(
+    name=NAME,
+    summary="EuRoC / ASL folder: IMU, cameras, ground truth",
+    recognised_by="a folder (or its mav0) with imu0/data.csv",
+    matches=lambda source: _root(source) is not None,
+    read_source=_read,
+)

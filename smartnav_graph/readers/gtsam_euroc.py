@@ -1,0 +1,99 @@
+"""The half minute of EuRoC V1_01_easy that every gtsam installation ships: IMU and feature tracks in one CSV.
+
+Burri et al. (2016), The EuRoC micro aerial vehicle datasets. The IMU's x axis points up and the camera looks along
+its z axis. The ``T_ci_*`` rows hold the camera's pose in the body (body_T_cam), despite their name: they equal the
+T_BS of the set's cam0. Stamps carry 17 digits, so they differ from the original's by up to 0.25 us.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, mount, vector_columns
+from smartnav_graph.readers.text import TextTable, first_lines, read_text
+from smartnav_graph.session import Device, Mount, Session
+
+NAME = "gtsam-euroc"
+FILE = "eqvio_processed_30s.csv"
+CAMERA = "cam0"
+GRAVITY = 9.81
+
+_HEADING = "row_type,t_abs,t_rel,seq,frame_idx,landmark_id,"
+
+
+def _path(source: str) -> Path:
+    return example_file(FILE) if source == NAME else Path(source)
+
+
+def _matches(source: str) -> bool:
+    return source == NAME or "".join(first_lines(Path(source), 1)).startswith(_HEADING)
+
+
+def _read(source: str, repairs: tuple[str, ...]) -> Session:
+    path = _path(source)
+    table = read_text(path)
+    table.require(("row_type", "t_abs", "frame_idx", "landmark_id", "u_norm", "v_norm", "key", "value"))
+    features = table.where("row_type", "vision_feature")
+    tables = {
+        "imu": (path, _imu_columns(table.where("row_type", "imu"))),
+        "images": (path, _image_columns(features)),
+        "tracks": (path, _track_columns(features)),
+    }
+    return build_session(
+        tables,
+        repairs,
+        device=Device(name="EuRoC VI-Sensor ADIS16448", forward="+z", up="+x"),
+        clock_epoch="unix",
+        gravity_m_s2=GRAVITY,
+        sensors={CAMERA: _mount(table.where("row_type", "meta"))},
+    )
+
+
+def _imu_columns(table: TextTable) -> Columns:
+    table.require(("gx", "gy", "gz", "ax", "ay", "az"))
+    gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
+    return {"t_ns": table.times("t_abs")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
+
+
+def _image_columns(features: TextTable) -> Columns:
+    """One row a frame. There are tracks but no pictures: the file name stays empty."""
+    frames, first = np.unique(features.ints("frame_idx"), return_index=True)
+    return {
+        "t_ns": features.times("t_abs")[first],
+        "image_id": frames,
+        "file": np.full(len(frames), "", dtype=object),
+        "camera": np.full(len(frames), CAMERA, dtype=object),
+    }
+
+
+def _track_columns(features: TextTable) -> Columns:
+    return {
+        "t_ns": features.times("t_abs"),
+        "image_id": features.ints("frame_idx"),
+        "track_id": features.ints("landmark_id"),
+        "x_n": features.floats("u_norm"),
+        "y_n": features.floats("v_norm"),
+    }
+
+
+def _mount(meta: TextTable) -> Mount:
+    values = dict(zip(meta.texts("key"), meta.texts("value"), strict=True))
+    names = [f"T_ci_{name}" for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
+    try:
+        t, q = np.split(np.array([float(values[name]) for name in names]), [3])
+    except (KeyError, ValueError) as error:
+        raise SessionError(meta.path, f"camera extrinsics: {error}", f"meta rows {', '.join(names)}") from error
+    return mount(t, Rotation.from_quat(q).as_matrix())
+
+
+READER = Reader(
+    name=NAME,
+    summary="EuRoC V1_01_easy, the 30 s shipped with gtsam: IMU 200 Hz, feature tracks 20 Hz",
+    recognised_by=f"the name {NAME!r}, or a CSV that begins with row_type,t_abs,t_rel",
+    matches=_matches,
+    read_source=_read,
+)
