@@ -3,7 +3,7 @@
 =========  ==========================================================================================
 ``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped
 ``nan``    rows with a non-finite required value dropped
-``stamps`` jittered stamps rebuilt: row order is kept, each stamp becomes its 4 s moving mean
+``stamps`` jittered inertial stamps rebuilt between gaps: row order is kept, each becomes its 4 s moving mean
 =========  ==========================================================================================
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.streams import Stream
+from smartnav_graph.streams import Imu, Stream
 from smartnav_graph.timebase import NS
 
 Table = dict[str, NDArray[Any]]
@@ -88,12 +88,34 @@ def _sort(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
 
 
 def _rebuild_stamps(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
+    """Only inertial samples come at a steady rate; the stamps of events (fixes, standstills) are what they are."""
+    if kind is not Imu:
+        return rows, {}
+    # a row delivered twice would push its neighbours aside
+    first = np.concatenate([[True], np.diff(np.asarray(rows["t_ns"], dtype=np.int64)) != 0])
+    rows = _keep(rows, first)
     t = np.asarray(rows["t_ns"], dtype=np.int64)
-    order = np.sort(t)
-    period = float(np.median(np.diff(order))) / NS if len(t) > 1 else 0.0
-    width = max(3, round(4.0 / period)) | 1 if period > 0 else 3
-    index = np.arange(len(t), dtype=np.float64)
-    slope = (order[-1] - order[0]) / max(len(t) - 1, 1)
-    smooth = uniform_filter1d((t - t[0]) - slope * index, width, mode="nearest") + slope * index
-    rebuilt = np.rint(smooth).astype(np.int64) + t[0]
-    return rows | {"t_ns": rebuilt}, {"stamps rebuilt": len(t)}
+    rebuilt = np.concatenate([_steady(part) for part in np.split(t, _breaks(t))])
+    return rows | {"t_ns": rebuilt}, {"repeated stamps dropped": int((~first).sum()), "stamps rebuilt": len(t)}
+
+
+def _breaks(t: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows after a step that jitter cannot explain: 8 robust sigmas of the steps (and 10 periods) above the median."""
+    step = np.diff(t)
+    if not len(step):
+        return np.zeros(0, dtype=np.intp)
+    median = float(np.median(step))
+    sigma = 1.4826 * float(np.median(np.abs(step - median)))
+    return np.asarray(np.flatnonzero(step > median + max(8.0 * sigma, 10.0 * median)) + 1)
+
+
+def _steady(t: NDArray[np.int64]) -> NDArray[np.int64]:
+    """4 s moving mean of stamps in row order, about their straight line of least squares."""
+    if len(t) < 3:
+        return t
+    rows = np.arange(len(t)) - (len(t) - 1) / 2
+    since = np.asarray(t - t[0], dtype=np.float64)
+    slope = float(rows @ since / (rows @ rows))
+    width = max(3, round(4.0 * NS / slope)) | 1 if slope > 0 else 3
+    smooth = uniform_filter1d(since - slope * rows, width, mode="reflect") + slope * rows
+    return np.asarray(np.rint(smooth).astype(np.int64) + t[0], dtype=np.int64)
