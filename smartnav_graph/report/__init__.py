@@ -1,0 +1,81 @@
+"""One run on one page: a self-contained HTML report, and the same facts as Markdown.
+
+The page holds its pictures as inline SVG and its style as inline CSS; it has no script and names no address, so that
+it opens anywhere, offline, and prints. How lines are thinned stands in `smartnav_graph.report.thin`.
+
+``data-`` attributes carry the figures in full precision: ``#imu-holes[data-count]`` with ``.hole[data-start-s]
+[data-length-s][data-kind]``, ``tr[data-sensor][data-rejected]``, ``tr[data-withheld][data-rms-horizontal-m]``,
+``#sigma-at[data-t-s][data-sigma-horizontal-m]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from smartnav_graph.files import replacing
+from smartnav_graph.report import facts
+from smartnav_graph.report.sections import page
+from smartnav_graph.session import Session
+from smartnav_graph.solution import Solution
+
+__all__ = ["report_markdown", "write_report"]
+
+
+def write_report(
+    path: str | Path,
+    *,
+    session: Session,
+    solution: Solution,
+    summary: Mapping[str, Any],
+    evaluation: Any = None,
+    causal: Solution | None = None,
+) -> None:
+    """Write the report of one run as a single HTML file; what stood at `path` is replaced.
+
+    Parameters
+    ----------
+    path : the file
+    session : what was recorded
+    solution : the smoothed states
+    summary : the table of summary.json; a part that is missing is left out, or said to be missing
+    evaluation : comparison with a reference: ``to_dict()``, and per epoch ``t_ns`` (n,), ``error_enu_m`` (n, 3),
+        ``rotation_error_deg`` (n,), ``sigma_enu`` (n, 3)
+    causal : the states as each became known while replaying
+
+    Raises
+    ------
+    SessionError
+        The file cannot be written.
+    """
+    text = page(session, solution, summary, evaluation, causal)
+    with replacing(path) as new:
+        new.write_text(text, encoding="utf-8")
+
+
+def report_markdown(summary: Mapping[str, Any], evaluation: Any = None) -> str:
+    """The headline, warnings and tables of the report as Markdown."""
+    parts = ["# Run report", " ".join(facts.headline(summary))]
+    told = facts.warnings(summary)
+    parts += ["## Warnings", "\n".join(f"- **{what}** {remedy}".rstrip() for what, remedy in told)] if told else []
+    compared = facts.evaluation_facts(evaluation)
+    start, start_table = facts.initialisation(summary)
+    holes = [f"- {facts.hole_sentence(*hole)}" for hole in facts.gaps(summary)]
+    tables = [
+        ("What was used", "\n".join(f"- {line}" for line in facts.why_lines(summary)), facts.used_table(summary, {})),
+        ("IMU holes", "\n".join(holes), None),
+        ("Withheld measurements", "", facts.withheld_table(summary)),
+        ("Against the reference", facts.evaluation_sentence(compared), facts.evaluation_table(compared)),
+        ("Estimated constants", "", facts.states_table(summary)),
+        ("Start", start, start_table),
+        ("Solver", "", facts.solver_table(summary)),
+        ("Timings", "", facts.timings_table(summary)),
+        ("Versions", "", facts.versions_table(summary)),
+    ]
+    for title, lead, table in tables:
+        if title == "Against the reference" and not compared:
+            continue
+        body = [part for part in (lead, table.markdown() if table else "") if part]
+        parts += [f"## {title}", *body] if body else []
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,139 @@
+"""Numbers in words, and tables that render as HTML and as Markdown alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+THIN = "\u202f"
+DASH = "–"
+
+
+def as_float(value: Any) -> float | None:
+    """A finite float, or None for anything else (absent, null, NaN, text)."""
+    if isinstance(value, bool) or value is None:
+        return None
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Decimal number with a true minus sign and thin spaces between thousands."""
+    text = f"{abs(value):,.{decimals}f}".replace(",", THIN)
+    return f"−{text}" if value < 0 and float(f"{value:.{decimals}f}") != 0 else text
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """`digits` significant figures, integer digits never rounded away; a dash for what is not known."""
+    v = as_float(value)
+    if v is None:
+        return DASH
+    if v == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(v)))
+    if exponent < -4:
+        mantissa, power = f"{v:.{max(digits - 2, 0)}e}".split("e")
+        return f"{mantissa}e{int(power)}".replace("-", "−")
+    return fixed(v, max(0, digits - 1 - exponent))
+
+
+def metres(value: Any) -> str:
+    """A small length: three figures, at least to the millimetre and at most to 0.1 mm."""
+    v = as_float(value)
+    return f"{DASH}" if v is None else f"{fixed(v, 4) if abs(v) < 0.01 else number(v)} m"
+
+
+def count(value: Any) -> str:
+    """A whole number."""
+    v = as_float(value)
+    return DASH if v is None else fixed(round(v), 0)
+
+
+def seconds(value: Any, decimals: int = 1) -> str:
+    v = as_float(value)
+    return DASH if v is None else f"{fixed(v, decimals)} s"
+
+
+def duration(value: Any) -> str:
+    """Seconds in the units people say: 42.1 s, 7 min 49 s, 1 h 02 min."""
+    v = as_float(value)
+    if v is None:
+        return DASH
+    if v < 60:
+        return f"{fixed(v, 1)} s"
+    whole = round(v)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def distance(value: Any) -> str:
+    """Metres below one kilometre, else kilometres."""
+    v = as_float(value)
+    if v is None:
+        return DASH
+    return f"{number(v / 1000)} km" if v >= 1000 else f"{number(v)} m"
+
+
+def plural(n: Any, one: str, many: str | None = None) -> str:
+    """``1 fix``, ``3 fixes``."""
+    return f"{count(n)} {one if as_float(n) == 1 else many or one + 's'}"
+
+
+def listed(parts: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def attributes(data: Mapping[str, Any]) -> str:
+    """``data-`` attributes of the values that are known, numbers in full precision."""
+    return "".join(f' data-{name}="{escape(str(value))}"' for name, value in data.items() if value is not None)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Cells of plain text; `data` becomes ``data-`` attributes of the HTML row."""
+
+    cells: Sequence[str]
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Plain text cells. The first column is a heading, columns named in `words` are text, the others numbers."""
+
+    header: Sequence[str]
+    rows: Sequence[Row]
+    words: frozenset[int] = frozenset()
+
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
+    def html(self) -> str:
+        """An HTML table in a box that scrolls on its own when it is wider than the page."""
+        kind = ["" if i == 0 or i in self.words else ' class="n"' for i in range(len(self.header))]
+        head = "".join(f'<th scope="col"{k}>{escape(h)}</th>' for h, k in zip(self.header, kind, strict=True))
+        body = "".join(self._row(row, kind) for row in self.rows)
+        top = f"<thead><tr>{head}</tr></thead>" if any(self.header) else ""
+        return f'<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div>'
+
+    @staticmethod
+    def _row(row: Row, kind: Sequence[str]) -> str:
+        cells = "".join(f"<td{k}>{escape(c)}</td>" for c, k in zip(row.cells[1:], kind[1:], strict=True))
+        return f'<tr{attributes(row.data)}><th scope="row">{escape(row.cells[0])}</th>{cells}</tr>'
+
+    def markdown(self) -> str:
+        """A GitHub-flavoured Markdown table."""
+        rule = [":--" if i == 0 or i in self.words else "--:" for i in range(len(self.header))]
+        rows = [self.header, rule, *(row.cells for row in self.rows)]
+        return "\n".join("| " + " | ".join(c.replace("|", "\\|").replace("\n", " ") for c in r) + " |" for r in rows)
