@@ -1,0 +1,351 @@
+"""Each rule with a session that breaks it, and with sessions that look odd but are sound."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.frames import Origin
+from smartnav_graph.health import Health, inspect, tilt_errors
+from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.simulation.scenarios import simulate
+from smartnav_graph.streams import Barometer, ControlPoint, GnssFix, Imu, Magnetometer, StaticPeriod
+from smartnav_graph.timebase import NS, ns_from_seconds
+
+T0 = 1_748_772_000 * NS
+G = 9.81
+
+
+def make_imu(seconds: float = 30.0, rate: float = 100.0, seed: int = 0) -> Imu:
+    """A car: rolls, pitches and yaws a little, with noise."""
+    t = np.arange(round(seconds * rate)) / rate
+    rng = np.random.default_rng(seed)
+    gyro = np.stack([0.05 * np.sin(3 * t), 0.05 * np.cos(2 * t), 0.2 * np.sin(0.3 * t)], axis=-1)
+    accel = np.array([0.0, 0.0, G]) + np.stack([np.sin(0.5 * t), np.cos(0.4 * t), 0.1 * np.sin(9 * t)], axis=-1)
+    noise = rng.normal(size=(2, len(t), 3))
+    return Imu(t_ns=T0 + ns_from_seconds(t), gyro=gyro + 0.003 * noise[0], accel=accel + 0.05 * noise[1])
+
+
+def make_fixes(first_s: float = 0.0, last_s: float = 29.0) -> GnssFix:
+    t = np.arange(first_s, last_s)
+    enu = np.stack([10 * t, np.sin(t), 0 * t], axis=-1)
+    return GnssFix(t_ns=T0 + ns_from_seconds(t), enu=enu, sigma=np.full((len(t), 3), 3.0))
+
+
+def make_session(**changes) -> Session:
+    start = {
+        "imu": make_imu(),
+        "gnss": make_fixes(),
+        "clock_epoch": "unix",
+        "gravity_m_s2": G,
+        "origin": Origin(52, 11, 0),
+    }
+    return Session(**(start | changes))
+
+
+def scaled(imu: Imu, *, gyro: float = 1.0, accel: float = 1.0) -> Imu:
+    return replace(imu, gyro=imu.gyro * gyro, accel=imu.accel * accel)
+
+
+def only(health: Health, level: str) -> str:
+    found = [str(finding) for finding in health.findings if finding.level == level]
+    assert len(found) == 1, found
+    return found[0]
+
+
+def test_sound_session_has_no_findings():
+    health = inspect(make_session())
+    assert health.findings == ()
+    health.raise_errors()
+    imu, gnss = health.streams
+    assert (imu.name, imu.rows, imu.start_s, imu.length_s) == ("imu", 3000, 0.0, 29.99)
+    assert imu.rate_hz == pytest.approx(100.0)
+    assert (gnss.rows, gnss.rate_hz) == (29, 1.0)
+    assert health.missing == ("calibration", "reference")
+
+
+@pytest.mark.parametrize("name", ["walk-60s", "static-60s", "figure-eight-60s", "phone-car-5min"])
+def test_simulated_sessions_have_no_warnings(name):
+    assert inspect(simulate(name, seed=1)).warnings() == []
+
+
+def test_accelerometer_in_g_and_scaled_twice():
+    warning = only(inspect(make_session(imu=scaled(make_imu(), accel=1 / G))), "warning")
+    assert "units of g" in warning and "multiply accel by 9.80665" in warning
+    warning = only(inspect(make_session(imu=scaled(make_imu(), accel=G))), "warning")
+    assert "9.81 once too often" in warning and "divide accel by 9.80665" in warning
+
+
+def test_gravity_removed_and_other_factors():
+    imu = make_imu()
+    assert "gravity seems removed" in only(
+        inspect(make_session(imu=replace(imu, accel=imu.accel - [0.0, 0.0, G - 2.0]))), "warning"
+    )
+    assert "times too large" in only(inspect(make_session(imu=scaled(imu, accel=3.28))), "warning")
+
+
+def test_gravity_at_rest():
+    rest = simulate("static-60s").imu
+    health = inspect(make_session(imu=replace(rest, accel=rest.accel * 1.2 * G / np.linalg.norm(rest.accel.mean(0)))))
+    assert health.quiet_accel_m_s2 == pytest.approx(1.2 * G, rel=1e-3)
+    assert any("+20.0 % off gravity" in warning for warning in health.warnings())
+    shaken = rest.accel + np.random.default_rng(0).normal(size=rest.accel.shape)
+    assert inspect(make_session(imu=replace(rest, accel=shaken))).quiet_accel_m_s2 is None
+
+
+@pytest.mark.parametrize("name", ["walk-60s", "figure-eight-60s", "phone-car-5min"])
+def test_gyro_in_degrees(name):
+    session = simulate(name)
+    wrong = session.replace(imu=scaled(session.imu, gyro=180 / np.pi))
+    assert "looks like deg/s; multiply gyro by pi/180" in only(inspect(wrong), "warning")
+
+
+def test_gyro_of_a_car_in_degrees_is_told_from_gravity():
+    wrong = scaled(make_imu(), gyro=180 / np.pi)
+    assert np.quantile(np.linalg.norm(wrong.gyro, axis=1), 0.999) < 35.0  # the peaks alone do not tell
+    assert "away from accel within 2 s" in only(inspect(make_session(imu=wrong)), "warning")
+
+
+def test_fast_hand_tells_degrees_by_rms():
+    t = np.arange(0, 30, 0.01)
+    gyro = np.stack([0 * t, 0 * t, 20 * np.sin(9 * t)], axis=-1)  # about the vertical: no tilt to compare
+    assert "RMS |gyro|" in only(inspect(make_session(imu=replace(make_imu(), gyro=gyro + 1e-3))), "warning")
+
+
+def test_foot_mounted_peaks_are_no_degrees():
+    """A foot swings at 10 rad/s about the lateral axis, and stands in between."""
+    rate = 200.0
+    t = np.arange(0, 20, 1 / rate)
+    phase = t % 1.0
+    swing = np.where(phase < 0.5, np.sin(4 * np.pi * phase), 0.0)
+    pitch = -10.0 / (4 * np.pi) * np.where(phase < 0.5, np.cos(4 * np.pi * phase) - 1, 0.0)
+    accel = G * np.stack([-np.sin(pitch), 0 * t, np.cos(pitch)], axis=-1)
+    accel[:, 0] += 15 * swing
+    rng = np.random.default_rng(0)
+    gyro = np.stack([0 * t, 10.0 * swing, 0 * t], axis=-1) + 0.01 * rng.normal(size=(len(t), 3))
+    imu = Imu(t_ns=T0 + ns_from_seconds(t), gyro=gyro, accel=accel + 0.05 * rng.normal(size=(len(t), 3)))
+    assert np.abs(gyro).max() > 9.9
+    fixes = GnssFix(t_ns=T0 + ns_from_seconds([1.0, 5.0]), enu=np.zeros((2, 3)), sigma=np.ones((2, 3)))
+    assert inspect(make_session(imu=imu, gnss=fixes)).warnings() == []
+
+
+def test_gyro_converted_twice():
+    turning = np.arange(0, 30, 0.01)
+    angle = 1.2 * np.sin(1.3 * turning)  # rad of pitch
+    gyro = np.stack([0 * angle, 1.2 * 1.3 * np.cos(1.3 * turning), 0 * angle], axis=-1)
+    accel = G * np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    rng = np.random.default_rng(0)
+    imu = Imu(
+        t_ns=T0 + ns_from_seconds(turning),
+        gyro=gyro + 1e-3 * rng.normal(size=gyro.shape),
+        accel=accel + 0.05 * rng.normal(size=accel.shape),
+    )
+    assert tilt_errors(imu)[1.0] < 1.0  # degrees: the analytic motion agrees with itself
+    assert inspect(make_session(imu=imu)).warnings() == []
+    wrong = make_session(imu=scaled(imu, gyro=np.pi / 180))
+    assert "multiply gyro by 180/pi" in only(inspect(wrong), "warning")
+
+
+def test_specific_force_must_point_up():
+    imu = scaled(make_imu(), accel=-1.0)
+    assert "flip the sign of accel" in only(inspect(make_session(imu=imu)), "warning")
+    assert inspect(make_session(imu=imu, device=Device(up="-z"))).warnings() == []
+    sideways = replace(make_imu(), accel=make_imu().accel[:, [2, 0, 1]])
+    assert inspect(make_session(imu=sideways)).warnings() == []
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_constant_inertial_sensor_is_an_error(sensor):
+    imu = make_imu()
+    health = inspect(make_session(imu=replace(imu, **{sensor: np.zeros_like(imu.gyro)})))
+    with pytest.raises(SessionError, match=f"imu: {sensor} is 0 0 0 in all 3000 rows; if the sensor did not record"):
+        health.raise_errors()
+
+
+def test_constant_aiding():
+    t = T0 + ns_from_seconds(np.arange(20.0))
+    magnetometer = Magnetometer(t_ns=t, field_ut=np.zeros((20, 3)))
+    assert "magnetometer: field is 0 0 0" in only(inspect(make_session(magnetometer=magnetometer)), "error")
+    still = replace(make_fixes(), enu=np.ones((29, 3)))
+    assert "gnss: position is 1 1 1 in all 29 rows" in only(inspect(make_session(gnss=still)), "warning")
+    barometer = Barometer(t_ns=t, pressure_hpa=np.full(20, 1013.0))
+    assert "barometer: pressure is 1013" in only(inspect(make_session(barometer=barometer)), "warning")
+
+
+def test_missing_empty_and_short_streams():
+    with pytest.raises(SessionError, match="no inertial stream"):
+        inspect(Session(gnss=make_fixes())).raise_errors()
+    with pytest.raises(SessionError, match="gnss: has no rows"):
+        inspect(make_session(gnss=make_fixes(0.0, 0.0))).raise_errors()
+    with pytest.raises(SessionError, match="one row only"):
+        inspect(make_session(imu=make_imu().take(slice(0, 1)))).raise_errors()
+    assert "lasts 0.490 s only" in inspect(make_session(imu=make_imu(0.5))).warnings()[0]
+
+
+def test_no_absolute_sensor():
+    health = inspect(make_session(gnss=None))
+    assert "no absolute sensor (gnss, control, pose_fixes)" in only(health, "warning")
+    assert "absolute sensor (gnss, control, pose_fixes)" in health.missing
+
+
+def test_fixes_outside_the_span_are_counted():
+    health = inspect(make_session(gnss=make_fixes(-3.0, 32.0)))
+    assert "5 of 35 rows lie outside the imu's span 0 to 29.990 s (the stream spans -3.000 to 31.000 s)" in only(
+        health, "warning"
+    )
+
+
+def test_no_overlap_at_all_is_an_error_unless_another_sensor_has_some():
+    late = make_fixes(100.0, 110.0)
+    with pytest.raises(SessionError, match=r"no row of gnss lies inside the imu's span 0 to 29\.990 s; bring"):
+        inspect(make_session(gnss=late)).raise_errors()
+    point = ControlPoint(
+        t_ns=[T0 + NS], enu=np.zeros((1, 3)), sigma=np.ones((1, 3)), point_id=np.array(["A"], dtype=object)
+    )
+    health = inspect(make_session(gnss=late, control=point))
+    health.raise_errors()
+    assert "10 of 10 rows lie outside" in only(health, "warning")
+
+
+def test_standstills_count_by_their_span():
+    static = StaticPeriod(t_ns=[T0 - NS], t_end_ns=[T0 + NS])
+    assert inspect(make_session(static=static)).warnings() == []
+
+
+def test_jumping_fixes():
+    fixes = make_fixes()
+    enu = np.array(fixes.enu)
+    enu[12] += [0.0, 400.0, 0.0]
+    assert "2 jumps faster than 100 m/s, the first at 12.000 s" in only(
+        inspect(make_session(gnss=replace(fixes, enu=enu))), "warning"
+    )
+
+
+def test_noise_of_fast_fixes_is_no_jump():
+    t = np.arange(0.0, 29.0, 0.1)
+    enu = 3.0 * np.random.default_rng(0).normal(size=(len(t), 3))
+    fixes = GnssFix(t_ns=T0 + ns_from_seconds(t), enu=enu, sigma=np.full((len(t), 3), 3.0))
+    assert np.linalg.norm(np.diff(enu, axis=0), axis=1).max() > 10.0  # more than 100 m/s
+    assert inspect(make_session(gnss=fixes)).warnings() == []
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1000, "0.1 Hz"), (0.001, "1e+05 Hz")])
+def test_stamps_in_another_unit(factor, told):
+    imu = make_imu()
+    t_ns = T0 + np.rint((imu.t_ns - T0) * factor).astype(np.int64)
+    warnings = inspect(make_session(imu=replace(imu, t_ns=t_ns))).warnings()
+    assert any(f"median rate {told} is outside" in warning for warning in warnings)
+
+
+def test_unix_clock_in_milliseconds():
+    imu, fixes = make_imu(), make_fixes()
+    shift = T0 - T0 // 1_000_000
+    early = make_session(imu=replace(imu, t_ns=imu.t_ns - shift), gnss=replace(fixes, t_ns=fixes.t_ns - shift))
+    assert "outside 1990 to 2100" in only(inspect(early), "warning")
+    assert inspect(early.replace(clock_epoch="boot")).warnings() == []
+
+
+def test_gaps_are_told_by_kind():
+    imu = make_imu()
+    kept = np.r_[0:1000, 1200:3000]
+    accel, gyro = np.array(imu.accel), np.array(imu.gyro)
+    for row in range(2001, 2050):  # a straight line
+        f = (row - 2000) / 50
+        accel[row], gyro[row] = (1 - f) * accel[2000] + f * accel[2050], (1 - f) * gyro[2000] + f * gyro[2050]
+    health = inspect(make_session(imu=replace(imu, accel=accel, gyro=gyro).take(kept)))
+    missing, bridged = health.warnings()
+    assert "1 stretches without samples, 2.01 s in all, longest 2.01 s at 9.99 s" in missing
+    assert "1 stretches filled by straight lines, 0.50 s in all, longest 0.50 s at 20.00 s" in bridged
+    assert [gap.kind for gap in health.gaps] == ["missing", "bridged"]
+
+
+def test_sigmas_heights_and_repairs_are_told():
+    fixes = replace(make_fixes(), sigma=None)
+    session = make_session(gnss=fixes, sensors={"gnss": Mount(frame="msl")}, dropped={"imu": {"rows sorted": 3}})
+    told = [str(finding) for finding in inspect(session).findings]
+    assert {finding.level for finding in inspect(session).findings} == {"info"}
+    assert told == [
+        "gnss: has no sigma columns; the default of the device class will be used",
+        "gnss: heights count from mean sea level, not from the ellipsoid",
+        "imu: 3 rows sorted",
+    ]
+    sigma = np.array(make_fixes().sigma)
+    sigma[3] = np.nan
+    partly = inspect(make_session(gnss=replace(fixes, sigma=sigma)))
+    assert "1 of 29 rows have no sigma" in only(partly, "info")
+
+
+def test_text_names_everything():
+    text = inspect(make_session(gnss=make_fixes(-3.0, 32.0))).to_text()
+    for part in (
+        "imu",
+        "3000",
+        "100.00",
+        "gravity: 9.81000",
+        "clock: unix",
+        "gaps: 0",
+        "missing: calibration",
+        "warning: gnss: 5",
+    ):
+        assert part in text
+
+
+DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
+real = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no real recordings at {DATASETS} (SMARTNAV_DATASETS)")
+
+
+def unit_alarms(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray, up: str = "+z") -> list[str]:
+    rows = np.r_[True, np.diff(t) > 0]
+    imu = Imu(t_ns=ns_from_seconds(t - t[0])[rows], gyro=gyro[rows], accel=accel[rows])
+    told = inspect(Session(imu=imu, gravity_m_s2=G, device=Device(up=up))).warnings()
+    return [warning for warning in told if "stretches" not in warning and "absolute" not in warning]
+
+
+@real
+@pytest.mark.parametrize(("side", "up"), [("Left", "+z"), ("Right", "+z")])
+def test_real_foot_raises_no_alarm(side, up):
+    rows = np.loadtxt(DATASETS / f"foot_dual_zupt/measData/imuMeas{side}.csv", delimiter=",", skiprows=1)
+    assert unit_alarms(np.arange(len(rows)) / 60.0, rows[:, 4:7], rows[:, 1:4], up) == []
+
+
+@real
+@pytest.mark.parametrize("session", ["Jakob_Nexus5_NoDist_Texting", "calib_acc_Nexus5_d1", "calib_mag_Nexus5_d1"])
+def test_real_phone_raises_no_alarm_and_tells_degrees(session):
+    folder = DATASETS / "phone_mocap_tyrex/android" / session
+
+    def table(name: str) -> np.ndarray:
+        with gzip.open(next(folder.glob(f"{name}.txt*")), "rt") as file:
+            return np.loadtxt(file)
+
+    accel, gyro = table("accelerometer"), table("gyroscope")
+    t = gyro[:, 0]
+    force = np.stack([np.interp(t, accel[:, 0], accel[:, i]) for i in (1, 2, 3)], axis=-1)
+    assert unit_alarms(t, gyro[:, 1:4], force) == []
+    assert "deg/s" in unit_alarms(t, np.degrees(gyro[:, 1:4]), force)[0]
+
+
+@real
+def test_real_motorway_raises_no_alarm_and_tells_degrees():
+    folder = DATASETS / "car_comma2k19/processed_log/IMU"
+    t, gyro = np.load(folder / "gyro/t"), np.load(folder / "gyro/value")
+    at, accel = np.load(folder / "accelerometer/t"), np.load(folder / "accelerometer/value")
+    force = np.stack([np.interp(t, at, column) for column in accel.T], axis=-1)
+    assert unit_alarms(t, gyro, force, up="-z") == []
+    assert "deg/s" in unit_alarms(t, np.degrees(gyro), force, up="-z")[0]
+
+
+@real
+def test_real_car_log_in_degrees_is_found():
+    with open(DATASETS / "phone_sensorlog_balzer/2014-02-14-002-Data.csv") as file:
+        rows = list(csv.DictReader(file))
+    names = ("millis", "rollrate", "pitchrate", "yawrate", "ax", "ay", "az")
+    values = np.array([[float(row[name]) for name in names] for row in rows])
+    found = unit_alarms(values[:, 0] / 1e3, values[:, 1:4], values[:, 4:7], up="-z")
+    assert len(found) == 1 and "looks like deg/s" in found[0]
