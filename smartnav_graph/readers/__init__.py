@@ -10,6 +10,7 @@ from pathlib import Path
 
 from smartnav_graph.errors import SessionError
 from smartnav_graph.readers import comma2k19, csv_folder, euroc, gtsam_euroc, gtsam_kitti
+from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import Session
 
@@ -36,21 +37,20 @@ def find(source: str | Path, name: str | None = None) -> Reader:
         The name is unknown, the source is missing, or none or several readers recognise it.
     """
     names = ", ".join(READERS)
-    if name is not None:
-        if name not in READERS:
-            raise SessionError("--format", f"unknown format {name!r}", f"one of {names}", "see `smartnav formats`")
-        return READERS[name]
+    if name is not None and name not in READERS:
+        raise SessionError("--format", f"unknown format {name!r}", f"one of {names}", "see `smartnav formats`")
     found = [reader for reader in READERS.values() if reader.matches(str(source))]
-    if len(found) == 1:
-        return found[0]
-    if found:
+    if not found and not Path(source).exists():
+        raise SessionError(source, "does not exist", "a file, a folder, gtsam-kitti or gtsam-euroc", "check the path")
+    if name is not None:
+        return READERS[name]
+    if len(found) > 1:
         several = ", ".join(reader.name for reader in found)
         raise SessionError(source, f"is recognised as {several}", "one format", "choose one with --format")
-    if not Path(source).exists():
-        raise SessionError(source, "does not exist", "a file, a folder, gtsam-kitti or gtsam-euroc", "check the path")
-    raise SessionError(
-        source, "is of no known format", f"one of {names}", "see `smartnav formats`, or name it with --format"
-    )
+    if not found:
+        remedy = "see `smartnav formats`, or name it with --format"
+        raise SessionError(source, "is of no known format", f"one of {names}", remedy)
+    return found[0]
 
 
 def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = ()) -> Session:
@@ -58,7 +58,7 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
 
     Parameters
     ----------
-    source : file or folder, or the literal ``gtsam-kitti`` / ``gtsam-euroc`` (found in the gtsam package)
+    source : file, folder, zip or tar archive, or the literal ``gtsam-kitti`` / ``gtsam-euroc`` (in the gtsam package)
     name : format; by default recognised by content
     repairs : names of `smartnav_graph.repair` to apply; what they touched is counted in `Session.dropped`
 
@@ -67,4 +67,15 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
     SessionError
         Unknown format, missing or unreadable file, wrong column, a cell that is no number, faulty rows.
     """
+    if is_archive(Path(source)):
+        with unpacked(Path(source)) as inside:
+            source = _entry(inside)
+            return find(source, name).read(source, repairs=repairs)
     return find(source, name).read(source, repairs=repairs)
+
+
+def _entry(folder: Path) -> Path:
+    """The only file of an unpacked folder, where it is a log by itself; else the folder."""
+    files = list(folder.iterdir())
+    alone = len(files) == 1 and any(reader.matches(str(files[0])) for reader in READERS.values())
+    return files[0] if alone else folder

@@ -42,7 +42,7 @@ def first_lines(path: Path, count: int = 2) -> list[str]:
     try:
         with path.open(encoding="utf-8-sig") as file:
             return [line.strip() for line, _ in zip(file, range(count), strict=False)]
-    except (OSError, UnicodeDecodeError):
+    except (OSError, ValueError):  # ValueError: no UTF-8, or a zero byte in the name
         return []
 
 

@@ -1,0 +1,55 @@
+"""Zip and tar archives: unpacked beside nothing of the user's, read, and gone again."""
+
+from __future__ import annotations
+
+import shutil
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from smartnav_graph.errors import SessionError
+
+
+def is_archive(path: Path) -> bool:
+    """Whether `path` is a zip or tar file, by content."""
+    try:
+        return path.is_file() and (zipfile.is_zipfile(path) or tarfile.is_tarfile(path))
+    except OSError:
+        return False
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder with the content of an archive; a single folder on top is entered.
+
+    Errors raised inside name the archive and the path within it.
+
+    Raises
+    ------
+    SessionError
+        The archive is damaged, or does not fit the temporary folder.
+    """
+    kind = "zip" if zipfile.is_zipfile(path) else "tar"
+    with tempfile.TemporaryDirectory() as scratch:
+        top = Path(scratch)
+        try:
+            _unpack(path, top, kind)
+        except (OSError, EOFError, zipfile.BadZipFile, tarfile.TarError) as error:
+            raise SessionError(path, f"cannot be unpacked ({error})", "a whole zip or tar file") from error
+        inside = list(top.iterdir())
+        folder = inside[0] if len(inside) == 1 and inside[0].is_dir() else top
+        try:
+            yield folder
+        except SessionError as error:
+            raise error.located(error.where.replace(scratch, str(path))) from error
+
+
+def _unpack(path: Path, folder: Path, kind: str) -> None:
+    if kind == "zip":
+        shutil.unpack_archive(path, folder, "zip")
+        return
+    with tarfile.open(path) as archive:
+        archive.extractall(folder, filter="data")

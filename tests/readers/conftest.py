@@ -1,0 +1,21 @@
+"""Where the public recordings lie; tests that need one are skipped where it is absent."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def dataset():
+    """Folder of a public recording, by name."""
+
+    def folder(name: str) -> Path:
+        path = Path(os.environ.get("SMARTNAV_DATASETS", ROOT / "../shared/datasets")) / name
+        if not path.is_dir():
+            pytest.skip(f"data set {name} is not there (set SMARTNAV_DATASETS)")
+        return path
+
+    return folder
