@@ -1,0 +1,209 @@
+"""Every format is read back by somebody else's parser."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from lxml import etree
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph import frames
+from smartnav_graph.errors import SessionError
+from smartnav_graph.export import FORMATS, GPX_NAMESPACE, export, write_trajectory_csv
+from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.solution import Solution
+
+ORIGIN = Origin(48.9825, 8.3904, 116.3)
+T0 = 1_748_772_000_123_456_789
+UTC0 = "2025-06-01T10:00:00.123456Z"
+KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
+
+
+def make_solution(n: int = 40, origin: Origin | None = ORIGIN) -> Solution:
+    rng = np.random.default_rng(7)
+    t = np.arange(n)
+    return Solution(
+        t_ns=T0 + t * 400_000_001,
+        nav_R_body=Rotation.from_euler("zyx", 0.1 * rng.normal(size=(n, 3)) + [2.0, 0.0, 0.0]).as_matrix(),
+        nav_t_body=np.cumsum(rng.normal(size=(n, 3)), axis=0),
+        nav_v_body=rng.normal(size=(n, 3)),
+        accel_bias=np.zeros((n, 3)),
+        gyro_bias=np.zeros((n, 3)),
+        covariance=np.broadcast_to(np.diag(np.r_[np.full(3, 1e-4), 0.09, 0.16, 4.0, np.ones(9)]), (n, 15, 15)),
+        t0_ns=T0,
+        origin=origin,
+    )
+
+
+@pytest.fixture
+def solution() -> Solution:
+    return make_solution()
+
+
+@pytest.fixture
+def lla(solution) -> np.ndarray:
+    return LocalFrame(solution.origin).lla_from_nav(solution.nav_t_body)
+
+
+def test_tum_stamps_are_exact_and_poses_read_back(solution, tmp_path):
+    export(solution, "tum", tmp_path / "a.tum")
+    rows = [line.split() for line in (tmp_path / "a.tum").read_text().splitlines()]
+    assert rows[0][0] == "1748772000.123456789"
+    assert [int(Decimal(row[0]) * 10**9) for row in rows] == solution.t_ns.tolist()
+    values = np.array([[float(x) for x in row[1:]] for row in rows])
+    assert np.array_equal(values[:, :3], solution.nav_t_body)
+    assert np.allclose(Rotation.from_quat(values[:, 3:]).as_matrix(), solution.nav_R_body, atol=1e-15)
+
+
+def test_tum_before_time_zero_of_a_clock(solution, tmp_path):
+    early = dataclasses.replace(solution, t_ns=solution.t_ns - T0 - 1_500_000_000)
+    export(early, "tum", tmp_path / "a.tum")
+    assert (tmp_path / "a.tum").read_text().startswith("-1.500000000 ")
+
+
+def test_tum_is_read_by_evo(solution, tmp_path):
+    from evo.tools.file_interface import read_tum_trajectory_file
+
+    export(solution, "tum", tmp_path / "a.tum")
+    path = read_tum_trajectory_file(str(tmp_path / "a.tum"))
+    assert np.array_equal(path.positions_xyz, solution.nav_t_body)
+    assert np.abs(np.sum(path.orientations_quat_wxyz * solution.quat_wxyz, axis=1)) == pytest.approx(1.0)
+
+
+def test_csv_is_trajectory_csv(solution, tmp_path):
+    export(solution, "csv", tmp_path / "a.csv")
+    with open(tmp_path / "a.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert ",".join(rows[0]) == (
+        "t_ns,e_m,n_m,u_m,lat_deg,lon_deg,height_m,qw,qx,qy,qz,ve_m_s,vn_m_s,vu_m_s,"
+        "heading_deg,pitch_deg,roll_deg,sigma_e_m,sigma_n_m,sigma_u_m,sigma_heading_deg"
+    )
+    for name, values in solution.trajectory_columns().items():
+        kind = int if name == "t_ns" else float
+        assert [kind(row[name]) for row in rows] == values.tolist(), name  # every bit
+
+
+def test_csv_leaves_the_unknown_empty(tmp_path):
+    write_trajectory_csv(make_solution(origin=None), tmp_path / "trajectory.csv")
+    with open(tmp_path / "trajectory.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row[name] for row in rows for name in ("lat_deg", "lon_deg", "height_m")} == {""}
+    assert all(row["e_m"] for row in rows)
+
+
+def test_csv_of_a_long_run_is_fast(tmp_path):
+    import time
+
+    long = make_solution(25_000)
+    start = time.process_time()
+    write_trajectory_csv(long, tmp_path / "trajectory.csv")
+    assert time.process_time() - start < 2.0  # s; measured 0.1, a Python loop over the cells takes several
+
+
+def test_kml_track_with_time_and_sigma(solution, lla, tmp_path):
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch="unix")
+    tree = etree.parse(str(tmp_path / "a.kml"))
+    coordinates = [[float(x) for x in node.text.split()] for node in tree.iterfind(".//gx:Track/gx:coord", KML)]
+    assert np.array_equal(np.array(coordinates)[:, [1, 0, 2]], lla)
+    when = [node.text for node in tree.iterfind(".//gx:Track/k:when", KML)]
+    assert when[0] == UTC0 and len(when) == len(solution)
+    arrays = {node.get("name"): node for node in tree.iterfind(".//gx:SimpleArrayData", KML)}
+    assert [float(v.text) for v in arrays["sigma_n_m"].iterfind("gx:value", KML)] == pytest.approx([0.4] * 40)
+    description = tree.findtext(".//k:Placemark/k:description", namespaces=KML)
+    assert "one sigma horizontal: median 0.500 m" in description and "vertical: median 2.000 m" in description
+    assert tree.findtext(".//gx:Track/k:altitudeMode", namespaces=KML) == "absolute"
+
+
+def test_kml_without_absolute_time_is_a_line_that_says_so(solution, lla, tmp_path):
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch="boot")
+    tree = etree.parse(str(tmp_path / "a.kml"))
+    text = tree.findtext(".//k:LineString/k:coordinates", namespaces=KML).split()
+    assert np.array_equal(np.array([[float(x) for x in c.split(",")] for c in text])[:, [1, 0, 2]], lla)
+    assert tree.find(".//k:when", KML) is None
+    assert "no absolute time" in tree.findtext(".//k:Placemark/k:description", namespaces=KML)
+
+
+def test_gpx_reads_back(solution, lla, tmp_path):
+    export(solution, "gpx", tmp_path / "a.gpx", clock_epoch="unix")
+    tree = etree.parse(str(tmp_path / "a.gpx"))
+    ns = {"g": GPX_NAMESPACE}
+    points = tree.findall(".//g:trk/g:trkseg/g:trkpt", ns)
+    values = [[float(p.get("lat")), float(p.get("lon")), float(p.findtext("g:ele", namespaces=ns))] for p in points]
+    assert np.abs(np.array(values) - lla)[:, :2].max() < 1e-10  # deg, 0.01 mm
+    assert np.abs(np.array(values) - lla)[:, 2].max() < 1e-4  # m
+    assert points[0].findtext("g:time", namespaces=ns) == UTC0
+
+
+def test_gpx_is_read_by_gpxpy(solution, lla, tmp_path):
+    gpxpy = pytest.importorskip("gpxpy")
+    export(solution, "gpx", tmp_path / "a.gpx", clock_epoch="unix")
+    points = gpxpy.parse((tmp_path / "a.gpx").read_text()).tracks[0].segments[0].points
+    assert [p.latitude for p in points] == pytest.approx(lla[:, 0], abs=1e-10)
+    assert [p.time.timestamp() for p in points] == pytest.approx(solution.t_ns / 1e9, abs=2e-6)
+
+
+def test_gpx_without_absolute_time(solution, tmp_path):
+    export(solution, "gpx", tmp_path / "a.gpx", clock_epoch="gps")
+    text = (tmp_path / "a.gpx").read_text()
+    assert "<time>" not in text and "no absolute time" in text
+
+
+def test_geojson_reads_back(solution, lla, tmp_path):
+    export(solution, "geojson", tmp_path / "a.geojson", clock_epoch="unix")
+    (feature,) = json.loads((tmp_path / "a.geojson").read_text())["features"]
+    assert feature["geometry"]["type"] == "LineString"
+    assert np.array_equal(np.array(feature["geometry"]["coordinates"])[:, [1, 0, 2]], lla)
+    properties = feature["properties"]
+    assert properties["t_ns"] == solution.t_ns.tolist()
+    assert properties["elapsed_s"] == solution.seconds.tolist()
+    assert properties["sigma_u_m"] == pytest.approx([2.0] * 40)
+    assert properties["coordTimes"][0] == UTC0
+    export(solution, "geojson", tmp_path / "b.geojson")
+    assert "coordTimes" not in json.loads((tmp_path / "b.geojson").read_text())["features"][0]["properties"]
+
+
+def test_geojson_of_an_unknown_covariance_is_valid_json(solution, tmp_path):
+    blind = dataclasses.replace(solution, covariance=np.full((40, 15, 15), np.nan))
+    export(blind, "geojson", tmp_path / "a.geojson")
+    (feature,) = json.loads((tmp_path / "a.geojson").read_text())["features"]
+    assert feature["properties"]["sigma_e_m"] == [None] * 40
+
+
+@pytest.mark.parametrize("format", ["kml", "gpx", "geojson"])
+def test_geographic_formats_need_an_origin(format, tmp_path):
+    with pytest.raises(SessionError, match=rf"--format {format}: .*no origin.*add lat_deg, lon_deg, height_m"):
+        export(make_solution(origin=None), format, tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_format(solution, tmp_path):
+    with pytest.raises(SessionError, match="--format: 'shp'; expected one of tum, kml, geojson, gpx, csv"):
+        export(solution, "shp", tmp_path / "a")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_nothing_existing_is_overwritten_without_force(solution, format, tmp_path):
+    (tmp_path / "a").write_text("precious")
+    with pytest.raises(SessionError, match="exists already"):
+        export(solution, format, tmp_path / "a")
+    assert (tmp_path / "a").read_text() == "precious"
+    export(solution, format, tmp_path / "a", force=True)
+    assert (tmp_path / "a").read_text() != "precious"
+
+
+@pytest.mark.parametrize("format", ["kml", "gpx", "geojson"])
+def test_a_failure_midway_leaves_the_old_file(solution, format, tmp_path, monkeypatch):
+    (tmp_path / "a").write_text("precious")
+
+    def broken(self, enu):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(frames.LocalFrame, "lla_from_nav", broken)
+    with pytest.raises(SessionError, match=r"could not be written \(No space left on device\)"):
+        export(solution, format, tmp_path / "a", force=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"] and (tmp_path / "a").read_text() == "precious"
