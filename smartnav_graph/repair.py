@@ -53,7 +53,7 @@ def repair(kind: type[Stream], table: Mapping[str, NDArray[Any]], names: Iterabl
     for name in check_names(names):
         if "t_ns" in rows and len(rows["t_ns"]):
             rows, found = {"nan": _drop_nan, "order": _sort, "stamps": _rebuild_stamps}[name](kind, rows)
-            counts |= {reason: count for reason, count in found.items() if count}
+            counts |= {reason: counts.get(reason, 0) + count for reason, count in found.items() if count}
     return rows, counts
 
 
