@@ -23,7 +23,9 @@ MOST_FAR = 6.0  # whitened residuals beyond are drawn at the edge and counted
 
 
 def figure(plots: Sequence[Plot], entries: Sequence[tuple[str, str]] = (), note: str = "") -> str:
-    """Plots one below the other with one legend."""
+    """Plots one below the other with one legend; the lowest names the shared x axis."""
+    for plot in plots[:-1]:
+        plot.x_title = ""
     caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
     return f"<figure>{legend(entries)}{''.join(p.render() for p in plots)}{caption}</figure>"
 
@@ -110,7 +112,7 @@ def biases(solution: Solution, gaps: Intervals) -> str:
     for name, unit, bias, spread in rooms:
         low, high = bias - 3 * spread, bias + 3 * spread
         for i, letter in enumerate("xyz"):
-            y = axis(_core(np.stack([low[:, i], high[:, i]])), count=4)
+            y = axis(_core(np.stack([low[:, i], high[:, i]])), count=5)
             plot = Plot(time_axis(float(t[0]), float(t[-1]), 4), y, f"{name} bias {letter} over time", height_px=140)
             plot.y_title = f"{name} {letter} [{unit}]"
             plot.spans(gaps)
@@ -119,7 +121,8 @@ def biases(solution: Solution, gaps: Intervals) -> str:
             plot.line(t, bias[:, i], "s0")
             figures.append(figure([plot]))
     marks = [("line s0", "Bias"), ("band s0", "± 1 sigma"), ("band s0 wide", "± 3 sigma"), *_shaded(gaps)]
-    return legend(marks) + grid(figures)
+    note = '<p class="fine">In body axes. Where the first seconds are wider than the frame they are cut.</p>'
+    return legend(marks) + grid(figures) + note
 
 
 def _core(values: Floats) -> Floats:
@@ -174,9 +177,9 @@ def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
         far = 0
         for used, cls in ((True, "res"), (False, "fix-rejected")):
             rows = r.of(sensor) & (r.used == used) & np.isfinite(r.whitened)
-            order = np.argsort(seconds[rows], kind="stable")
-            x, y = thin_dots(seconds[rows][order], r.whitened[rows][order], 1200)
-            plot.dots(x, np.clip(y, -MOST_FAR * 0.97, MOST_FAR * 0.97), cls)
+            x, y = seconds[rows], np.clip(r.whitened[rows], -MOST_FAR * 0.97, MOST_FAR * 0.97)
+            shown = thin_dots(np.abs(y) > 3.0, 1500)
+            plot.dots(x[shown], y[shown], cls)
             far += int((np.abs(r.whitened[rows]) > MOST_FAR).sum())
         note = f"{count(far)} beyond ± {fixed(MOST_FAR, 0)} sigma, drawn at the edge." if far else ""
         figures.append(figure([plot], note=note))
@@ -210,7 +213,7 @@ def distribution(errors: ArrayLike, what: str) -> str:
             f"{p} %: {metres(at)}",
             f"note {'' if right else 'end'}",
             dx=9 if right else -9,
-            dy=5 if right else -7,
+            dy=15 if right else -7,
         )
     return figure([plot], note=f"{count(len(e))} {what}.")
 
@@ -223,14 +226,14 @@ def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> st
         return ""
     error, t = np.asarray(error, dtype=np.float64), (np.asarray(at) - solution.t0_ns) / 1e9
     sigma = getattr(evaluation, "sigma_enu", None)
-    limit = axis(_core(np.stack([error, -error])), include=(0.0,), count=4)
+    limit = axis(error, include=(0.0,), count=4)
     plots = []
     for i, name in enumerate(AXES):
         plot = _over_time(solution, limit, f"{name} error [m]", gaps, 130)
         if sigma is not None:
             spread = np.asarray(sigma, dtype=np.float64)[:, i]
             plot.band(t, -spread, spread, f"s{i}")
-        plot.line(t, error[:, i], f"s{i}")
+        plot.line(t, error[:, i], f"s{i} solid")
         plots.append(plot)
     rotation = getattr(evaluation, "rotation_error_deg", None)
     if rotation is not None and len(finite(rotation)):
@@ -238,4 +241,4 @@ def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> st
         turn.line(t, np.asarray(rotation, dtype=np.float64), "s3")
         plots.append(turn)
     band = [("band s0", "± 1 sigma, as estimated")] if sigma is not None else []
-    return figure(plots, [*((f"line s{i}", f"{n} error") for i, n in enumerate(AXES)), *band, *_shaded(gaps)])
+    return figure(plots, [*((f"line s{i} solid", f"{n} error") for i, n in enumerate(AXES)), *band, *_shaded(gaps)])

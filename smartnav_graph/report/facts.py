@@ -117,7 +117,8 @@ def _left_out(summary: Summary) -> str:
     said = []
     rejected = {name: n for name, n in room(summary, "rejected").items() if as_float(n)}
     if rejected:
-        said.append(f"{listed([things(k, n) for k, n in rejected.items()])} rejected as outliers")
+        were = "was" if sum(as_float(n) or 0 for n in rejected.values()) == 1 else "were"
+        said.append(f"{listed([things(k, n) for k, n in rejected.items()])} {were} rejected as outliers")
     elif "rejected" in summary:
         said.append("no measurement was rejected")
     holes = gaps(summary)
@@ -135,7 +136,8 @@ def _withheld(summary: Summary) -> str:
             continue
         rms = as_float(score.get("rms_horizontal_m"))
         met = f"; the result meets them within {metres(rms)} (RMS, horizontal)" if rms is not None else ""
-        parts.append(f"{things(name, score['count'])} were withheld from the estimate{met}.")
+        were = "was" if as_float(score["count"]) == 1 else "were"
+        parts.append(f"{things(name, score['count'])} {were} withheld from the estimate{met}.")
     return " ".join(parts)
 
 
@@ -172,22 +174,19 @@ def withheld_counts(summary: Summary) -> dict[str, Any]:
 
 
 def used_table(summary: Summary, recorded: Mapping[str, int]) -> Table:
-    """Per sensor: rows recorded, factors used, rejected, withheld, dropped on reading, chi2 per dof."""
+    """Per sensor: rows recorded (where told), factors used, rejected, withheld, dropped on reading, chi2 per dof."""
     factors, rejected, dropped = (room(summary, k) for k in ("factors", "rejected", "dropped"))
     withheld, chi2 = withheld_counts(summary), chi2_by_sensor(summary)
     names = dict.fromkeys([*recorded, *factors, *rejected, *withheld, *dropped, *chi2])
     rows = []
     for name in names:
-        lost = sum(as_float(n) or 0.0 for n in room(dropped, name).values())
-        cells = [
-            sensor_name(name),
-            *(count(t.get(name, 0 if t is not recorded else None)) for t in (recorded, factors, rejected, withheld)),
-            count(lost),
-            number(chi2.get(name)),
-        ]
-        data = {"sensor": name, "used": factors.get(name), "rejected": rejected.get(name), "dropped": round(lost)}
-        rows.append(Row(cells, data))
-    return Table(("Sensor", "Recorded", "Factors", "Rejected", "Withheld", "Dropped", "χ² / dof"), rows)
+        lost = round(sum(as_float(n) or 0.0 for n in room(dropped, name).values()))
+        known = [count(recorded.get(name))] if recorded else []
+        used = [count(t.get(name, 0)) for t in (factors, rejected, withheld)]
+        data = {"sensor": name, "used": factors.get(name), "rejected": rejected.get(name), "dropped": lost}
+        rows.append(Row([sensor_name(name), *known, *used, count(lost), number(chi2.get(name))], data))
+    first = ("Sensor", "Recorded") if recorded else ("Sensor",)
+    return Table((*first, "Factors", "Rejected", "Withheld", "Dropped", "χ² / dof"), rows)
 
 
 def why_lines(summary: Summary) -> list[str]:
@@ -267,9 +266,9 @@ def initialisation(summary: Summary) -> tuple[str, Table]:
     """How the start was found, in a sentence, and what else is known of it."""
     start = summary.get("initialisation")
     if isinstance(start, str):
-        return start, Table(("", ""), [])
+        return capital(start), Table(("", ""), [])
     table = room(summary, "initialisation")
-    sentence = str(table.get("sentence") or "")
+    sentence = capital(str(table.get("sentence") or ""))
     rest = {k: v for k, v in table.items() if k != "sentence" and not isinstance(v, Mapping)}
     rows = [
         Row([_state_name(k), str(v) if as_float(v) is None and not isinstance(v, list) else _values(v)])

@@ -198,7 +198,7 @@ def against_reference(evaluation: Any, compared: Summary, solution: Solution, ga
 def machinery(summary: Summary) -> list[str]:
     """States, start, solver, timings, versions."""
     sentence, start = facts.initialisation(summary)
-    said = f"<p>{escape(capital(sentence))}</p>" if sentence else ""
+    said = f"<p>{escape(sentence)}</p>" if sentence else ""
     began = said + (start.html() if start else "")
     states, solver, versions = facts.states_table(summary), facts.solver_table(summary), facts.versions_table(summary)
     return [

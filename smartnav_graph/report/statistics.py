@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.report.facts import Certainty, room, withheld_counts
+from smartnav_graph.report.facts import Certainty, room, sensor_name, withheld_counts
 from smartnav_graph.report.text import Row, Table, as_float, count, distance, duration, fixed, metres, number
 from smartnav_graph.session import Session
 from smartnav_graph.solution import POS, Solution
@@ -50,7 +50,7 @@ def key_figures(summary: Mapping[str, Any], sure: Certainty | None) -> list[tupl
     for name in withheld_counts(summary):
         rms = room(room(summary, "withheld"), name).get("rms_horizontal_m")
         if as_float(rms) is not None:
-            tiles.append((f"Withheld {name}, RMS", metres(rms)))
+            tiles.append((f"Withheld {sensor_name(name)}, RMS", metres(rms)))
     return tiles
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from smartnav_graph.report.text import fixed
-from smartnav_graph.report.thin import thin_band, thin_dots, thin_line
+from smartnav_graph.report.thin import thin_band, thin_line
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def exact_axis(lo: float, hi: float, *, count: int = 6, step: float | None = Non
     return Axis(lo, hi, *ticks_between(lo, hi, step or round_step(hi - lo, count)))
 
 
-def time_axis(lo: float, hi: float, count: int = 7) -> Axis:
+def time_axis(lo: float, hi: float, count: int = 12) -> Axis:
     """Seconds since the start; ticks at whole seconds, minutes and hours told in seconds."""
     span = max(hi - lo, 1e-9)
     return exact_axis(lo, hi, step=next((s for s in TIME_STEPS if span / s <= count), None), count=count)
@@ -156,10 +156,11 @@ class Plot:
         self._shapes.append(f'<path class="band {cls}" d="{path(ring)}z"/>')
 
     def dots(self, x: ArrayLike, y: ArrayLike, cls: str) -> None:
-        """Round marks of constant size; at most as many as `thin_dots` keeps."""
-        xs, ys = thin_dots(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-        if len(xs):
-            d = "".join(f"M{a} {b}h0" for a, b in self.points(xs, ys))
+        """Round marks of constant size where x and y are finite."""
+        xs, ys = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        good = np.isfinite(xs) & np.isfinite(ys)
+        if good.any():
+            d = "".join(f"M{a} {b}h0" for a, b in self.points(xs[good], ys[good]))
             self._shapes.append(f'<path class="dots {cls}" d="{d}"/>')
 
     def area(self, ring_x: ArrayLike, ring_y: ArrayLike, cls: str) -> None:
@@ -207,21 +208,29 @@ class Plot:
         return f'<path class="mesh" d="{d}"/><path class="frame" d="M0 0V{height}H{UNITS}"/>'
 
     def _tick_labels(self) -> str:
+        """Labels at the ticks; every second one along a crowded x axis is marked ``odd``: narrow pages hide it."""
         at_x = 100 * self.x.fraction(self.x.ticks)
         at_y = 100 * (1.0 - self.y.fraction(self.y.ticks))
-        along = (f'<text class="tick tx" x="{p:.2f}%" y="100%" dy="19">{escape(t)}</text>'
-                 for p, t in zip(at_x, self.x.labels, strict=True))  # fmt: skip
+        along = (f'<text class="tick tx{odd}" x="{p:.2f}%" y="100%" dy="19">{escape(t)}</text>'
+                 for p, t, odd in zip(at_x, self.x.labels, self._odd(), strict=True))  # fmt: skip
         up = (f'<text class="tick ty" x="0" y="{p:.2f}%" dx="-7" dy="4">{escape(t)}</text>'
               for p, t in zip(at_y, self.y.labels, strict=True))  # fmt: skip
         return "".join([*along, *up])
 
+    def _odd(self) -> list[str]:
+        ticks = self.x.ticks
+        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
+        return [" odd" if len(ticks) > 5 and round(tick / step) % 2 else "" for tick in ticks]
+
     def render(self) -> str:
         """The ``<svg>`` element."""
         size = f"aspect-ratio:{self.aspect:.4f}" if self.aspect else f"height:{self.height_px}px"
+        kind = "plot" if self.x_title else "plot above"
         titles = f'<text class="title ty0" x="-48" y="-13">{escape(self.y_title)}</text>' if self.y_title else ""
-        titles += f'<text class="title tx0" x="100%" y="100%" dy="37">{escape(self.x_title)}</text>'
+        if self.x_title:
+            titles += f'<text class="title tx0" x="100%" y="100%" dy="37">{escape(self.x_title)}</text>'
         return (
-            f'<svg class="plot" style="{size}" role="img" aria-label="{escape(self.label)}">'
+            f'<svg class="{kind}" style="{size}" role="img" aria-label="{escape(self.label)}">'
             f'<svg class="box" viewBox="0 0 {UNITS} {self._height:.0f}" preserveAspectRatio="none" '
             f'width="100%" height="100%">{self._grid()}{"".join(self._shapes)}</svg>'
             f"{self._tick_labels()}{titles}{''.join(self._texts)}</svg>"

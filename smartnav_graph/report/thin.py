@@ -4,7 +4,7 @@
   (so that no spike vanishes), with the first and the last point of the line.
 * A band: of each bucket the lowest lower and the highest upper edge.
 * A path on the map: Ramer-Douglas-Peucker (Douglas and Peucker 1973), the tolerance doubled until it fits.
-* Dots: the same as a line, on whatever is drawn.
+* Dots: an even random choice with a fixed seed (every 9th row would show one axis only), outliers first.
 """
 
 from __future__ import annotations
@@ -56,16 +56,17 @@ def thin_band(x: Floats, low: Floats, high: Floats, most: int = MOST // 4) -> tu
     return middle, np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
 
 
-def thin_dots(x: Floats, y: Floats, most: int = MOST) -> tuple[Floats, Floats]:
-    """Dots that can be seen: finite ones, thinned like a line when x is ordered, else every k-th."""
-    good = np.isfinite(x) & np.isfinite(y)
-    x, y = x[good], y[good]
-    if len(x) <= most:
-        return x, y
-    if (np.diff(x) >= 0).all():
-        return thin_line(x, y, most)
-    every = -(-len(x) // most)
-    return x[::every], y[::every]
+def thin_dots(special: NDArray[np.bool_], most: int = MOST) -> NDArray[np.intp]:
+    """Indices of at most `most` dots: up to half of them `special` ones, the rest chosen evenly at random."""
+    if len(special) <= most:
+        return np.arange(len(special))
+    rng = np.random.default_rng(0)  # fixed: the same run gives the same page
+
+    def some(rows: NDArray[np.intp], n: int) -> NDArray[np.intp]:
+        return rows if len(rows) <= n else rng.choice(rows, n, replace=False)
+
+    marked = some(np.flatnonzero(special), most // 2)
+    return np.sort(np.concatenate([marked, some(np.flatnonzero(~special), most - len(marked))]))
 
 
 def thin_path(xy: Floats, tolerance: float, most: int = MOST) -> NDArray[np.intp]:

@@ -18,7 +18,7 @@ from smartnav_graph.timebase import nearest
 Floats = NDArray[np.float64]
 
 FIXES = ("gnss", "control", "pose_fixes")
-SHAPES = (0.9, 2.2)  # width / height of the map
+SHAPES = (1.25, 2.4)  # width / height of the map
 ELLIPSES = 30
 
 
@@ -60,7 +60,7 @@ def _axes(points: Floats) -> tuple[Axis, Axis, float]:
     width, height = max(size[0], size[1] * SHAPES[0]), max(size[1], size[0] / SHAPES[1])
     middle, half = (lo + hi) / 2, np.array([width, height]) / 2
     (west, south), (east, north) = middle - half, middle + half
-    step = round_step(max(width, height), 6)
+    step = round_step(max(width, height), 9)
     axes = [Axis(a, b, *ticks_between(a, b, step)) for a, b in ((west, east), (south, north))]
     return axes[0], axes[1], float(width / height)
 
@@ -85,7 +85,7 @@ def draw(
     entries += _gaps(plot, solution, gaps) + _ellipses(plot, solution)
     _ends(plot, path)
     _furniture(plot, path)
-    widest = f"max-width:min(100%,calc(640px*{aspect:.3f} + 70px))"
+    widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
     return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
 
 
@@ -139,7 +139,7 @@ def _ellipses(plot: Plot, solution: Solution) -> list[tuple[str, str]]:
     value, vector = np.linalg.eigh(block)
     axes = np.sqrt(np.clip(value, 0.0, None))
     wanted = 0.018 * (plot.x.hi - plot.x.lo)
-    typical = float(np.median(axes[:, 1]))
+    typical = max(float(np.median(axes[:, 1])), float(axes[:, 1].max()) / 4)
     scale = max(1.0, round_step(wanted / typical, 1)) if typical > 0 else 1.0
     angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)])

@@ -1,0 +1,196 @@
+"""What a reader, or a script that reads the DOM, finds in the report."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drive_case import HOLES, REJECTED, drive, summary
+from lxml import html
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.report import report_markdown, write_report
+from smartnav_graph.session import Session
+from smartnav_graph.solution import Residuals
+
+
+@pytest.fixture(scope="module")
+def dom(page):
+    return html.fromstring(page.read_text(encoding="utf-8"))
+
+
+def words(node) -> str:
+    return " ".join(" ".join(node.itertext()).split()).replace("\u202f", " ")
+
+
+def written(tmp_path: Path, case, **changes):
+    arguments = {"session": case.session, "solution": case.solution, "summary": case.summary} | changes
+    write_report(tmp_path / "report.html", **arguments)
+    return html.fromstring((tmp_path / "report.html").read_text(encoding="utf-8"))
+
+
+def section(dom, name: str):
+    return dom.get_element_by_id(name)
+
+
+def test_headline_says_what_happened(dom) -> None:
+    text = words(section(dom, "headline"))
+    assert "The recording of 7 min 49 s over 4.32 km was smoothed in one batch at 470 epochs." in text
+    assert "4 GNSS fixes were rejected as outliers; the IMU record has 4 holes, 7.1 s in all." in text
+    assert "235 GNSS fixes were withheld from the estimate; the result meets them within 0.284 m" in text
+
+
+def test_position_sigma_at_300_s_is_that_of_the_covariance(dom, case) -> None:
+    node = section(dom, "sigma-at")
+    e, n = np.sqrt(np.diag(case.solution.covariance[300])[3:5])
+    assert float(node.get("data-t-s")) == 300.0
+    assert float(node.get("data-sigma-e-m")) == pytest.approx(e, rel=1e-9)
+    assert float(node.get("data-sigma-horizontal-m")) == pytest.approx(np.hypot(e, n), rel=1e-9)
+    assert f"At t = 300 s the position is known to {np.hypot(e, n):.2f} m (1 sigma, horizontal)" in words(node)
+
+
+def test_short_run_tells_its_middle(tmp_path) -> None:
+    case = drive(61)
+    node = section(written(tmp_path, case), "sigma-at")
+    assert float(node.get("data-t-s")) == 30.0
+    assert words(node).startswith("At t = 30 s the position is known to")
+
+
+def test_imu_holes(dom) -> None:
+    node = section(dom, "imu-holes")
+    found = [
+        (float(h.get("data-start-s")), float(h.get("data-length-s")), h.get("data-kind"))
+        for h in node.find_class("hole")
+    ]
+    assert node.get("data-count") == "4"
+    assert found == HOLES
+    assert "IMU hole at 36.4 s, 1.59 s, bridged by interpolation" in words(node)
+    assert "IMU hole at 307.8 s, 2.41 s, no samples" in words(node)
+
+
+def test_used_rejected_dropped_withheld(dom) -> None:
+    (row,) = section(dom, "used").xpath('.//tr[@data-sensor="gnss"]')
+    assert (row.get("data-rejected"), row.get("data-used"), row.get("data-dropped")) == ("4", "231", "2")
+    assert [words(c) for c in row] == ["GNSS", "470", "231", "4", "235", "2", "1.11"]
+    (row,) = section(dom, "withheld").xpath(".//tr[@data-withheld]")
+    assert (row.get("data-withheld"), row.get("data-rms-horizontal-m")) == ("235", "0.284")
+
+
+def test_map_marks_the_rejected_fixes_where_they_are(dom, case) -> None:
+    from smartnav_graph.report.track import fix_states
+
+    xy, state = fix_states(case.session, case.solution)["gnss"]
+    assert np.flatnonzero(state == "rejected").tolist() == list(REJECTED)
+    (marks,) = section(dom, "map").xpath('.//svg[@class="box"]/path[contains(@class, "fix-rejected")]')
+    east = np.array([float(m) for m in re.findall(r"M(\d+)", marks.get("d"))])
+    span = (east[3] - east[0]) / 10_000  # drawing units to shares of the width
+    assert np.sign(span) == np.sign(xy[301, 0] - xy[50, 0])
+
+
+def test_reference_errors_are_tabled_with_percentiles(dom, case) -> None:
+    (row,) = section(dom, "reference").xpath('.//tr[@data-error="ape_m"]')
+    assert float(row.get("data-rmse")) == case.evaluation.to_dict()["ape_m"]["rmse"]
+    text = words(section(dom, "reference"))
+    assert "Compared with truth.csv at 470 epochs after yaw alignment, 4 epochs of it outside the run." in text
+    horizontal = np.linalg.norm(case.evaluation.error_enu_m[:, :2], axis=1)
+    assert f"67 %: {np.percentile(horizontal, 67):.3f} m" in text
+    assert "Yaw 1.10 1" in words(section(dom, "reference").xpath(".//table")[2])
+
+
+def test_sections_stand_in_reading_order(dom) -> None:
+    ids = [node.get("id") for node in dom.xpath("//header | //section")]
+    assert ids == [
+        *("headline", "warnings", "map", "statistics", "used", "imu-holes", "uncertainty", "motion", "attitude"),
+        *("biases", "residuals", "withheld", "reference", "states", "start", "solver", "timings", "versions"),
+    ]
+
+
+def test_foreign_text_is_escaped_and_nothing_is_fetched(page) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;b&gt;missing&lt;/b&gt; &amp; assumed" in text
+    assert not re.search(r"<script|https?:|src=|href=|url\(|@import", text)
+
+
+def test_statistics_of_motion_and_imu(dom, case) -> None:
+    text = words(section(dom, "statistics"))
+    speed = np.linalg.norm(case.solution.nav_v_body, axis=1)
+    rate = np.degrees(np.linalg.norm(case.session.imu.gyro, axis=1))
+    assert f"{speed.max():.1f} m/s" in text
+    assert f"{rate.max():.1f} °/s at {rate.argmax() * 0.02:.1f} s" in text
+    assert "Standing still" in text
+
+
+def test_empty_summary_claims_nothing(tmp_path, case) -> None:
+    dom = written(tmp_path, case, summary={})
+    assert "The run did not record IMU holes." in words(section(dom, "imu-holes"))
+    assert section(dom, "imu-holes").get("data-count") is None
+    assert "did not record what was rejected" in words(section(dom, "used"))
+    assert "no measurement was rejected" not in words(dom).lower()
+    assert not dom.xpath('//section[@id="withheld" or @id="timings" or @id="versions"]')
+
+
+def test_clean_run_says_so(tmp_path, case) -> None:
+    clean = summary() | {"gaps": [], "rejected": {}, "dropped": {}, "warnings": []}
+    dom = written(tmp_path, case, summary=clean)
+    assert "No measurement was rejected; the IMU record has no holes." in words(section(dom, "headline"))
+    assert "No warnings." in words(section(dom, "warnings"))
+    assert section(dom, "imu-holes").get("data-count") == "0"
+
+
+def test_failed_solve_stands_in_headline_and_warnings(tmp_path, case) -> None:
+    bad = summary() | {"converged": False, "chi2_per_dof": {"overall": 6.2}}
+    dom = written(tmp_path, case, summary=bad)
+    assert "The solver did not converge: do not rely on this result." in words(section(dom, "headline"))
+    text = words(section(dom, "warnings"))
+    assert "stopped after 7 iterations without converging" in text
+    assert "chi2 per degree of freedom 6.20" in text
+
+
+def test_dead_reckoning_is_named(tmp_path, case) -> None:
+    dom = written(tmp_path, case, summary={"mode": "dead-reckoning"})
+    assert "nothing ties it to an absolute position" in words(section(dom, "headline"))
+
+
+def test_bare_solution(tmp_path, case) -> None:
+    """No origin, no residuals, no IMU, no fixes, unknown covariance; then a single epoch."""
+    bare = replace(
+        case.solution, residuals=Residuals.empty(), origin=None, covariance=case.solution.covariance * np.nan
+    )
+    dom = written(tmp_path, case, session=Session(), solution=bare, summary={"gaps": None, "withheld": None})
+    assert "gives no position uncertainty" in words(section(dom, "sigma-at"))
+    assert "recorded no residuals" in words(section(dom, "residuals"))
+    assert "nan" not in words(dom).lower()
+    assert not any("nan" in d for d in dom.xpath("//path/@d"))
+    one = {name: getattr(bare, name)[:1] for name in ("t_ns", "nav_R_body", "nav_t_body", "nav_v_body")}
+    one |= {name: getattr(bare, name)[:1] for name in ("accel_bias", "gyro_bias", "covariance")}
+    dom = written(tmp_path, case, session=Session(), solution=replace(bare, **one), summary={})
+    assert "no path to draw" in words(section(dom, "map"))
+
+
+def test_37_minutes_stay_small_and_quick(tmp_path) -> None:
+    case = drive(2220)
+    start = time.process_time()
+    dom = written(tmp_path, case, causal=case.causal, evaluation=case.evaluation)
+    assert time.process_time() - start < 3.0  # s, on a busy machine; 0.3 s alone
+    assert (tmp_path / "report.html").stat().st_size < 3_000_000
+    assert max(len(re.findall(r"[ ,M-]", d)) // 2 for d in dom.xpath('//path[contains(@class, "line")]/@d')) <= 3000
+
+
+def test_unwritable_place_is_a_named_error(tmp_path, case) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SessionError, match="cannot be written"):
+        write_report(tmp_path / "file" / "r.html", session=case.session, solution=case.solution, summary={})
+
+
+def test_markdown_carries_the_same_facts(case) -> None:
+    text = report_markdown(case.summary, case.evaluation)
+    assert "was smoothed in one batch at 470 epochs" in text
+    assert "| GNSS | 231 | 4 | 235 | 2 | 1.11 |" in text
+    assert "- IMU hole at 36.4 s, 1.59 s, bridged by interpolation" in text
+    assert "| GNSS | 235 | 0.284 m | 0.410 m | 1.32 m |" in text
+    assert "Started while moving" in text
+    assert report_markdown({}).startswith("# Run report\n\nThe recording was smoothed.")
