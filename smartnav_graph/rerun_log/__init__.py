@@ -96,7 +96,7 @@ def _log_all(
     story.log_status(recorder, session, found)
     story.log_lines(recorder, session, found, summary, told)
     story.log_report(recorder, report_markdown)
-    return blueprint.build(recorder, session, solution, extent, found, factor)
+    return blueprint.build(recorder, session, solution, extent, factor)
 
 
 def _log_scene(
@@ -113,8 +113,8 @@ def _log_scene(
     recorder.style("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     scene = spatial.Scene(recorder, session, extent)
     if session.reference is not None:
-        scene.path("reference", session.reference.enu, colours.REFERENCE, 1.5)
+        scene.path("reference", session.reference.enu, colours.REFERENCE, 0.8)
     if causal is not None:
-        scene.path("causal", causal.nav_t_body, colours.CAUSAL, 1.5)
+        scene.path("causal", causal.nav_t_body, colours.CAUSAL, 1.2)
     spatial.log_fixes(scene, found)
     return 1.0 if solution is None else spatial.log_solution(scene, solution)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smartnav_graph.rerun_log import signals
-from smartnav_graph.rerun_log.events import Events
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.rerun_log.spatial import Extent, nice
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
+
+Floats = NDArray[np.float64]
 
 _SIGNALS = (
     ("Accelerometer m/s²", "/imu/accel"),
@@ -31,19 +33,22 @@ _ACCURACY = (
 _BIASES = (("Accelerometer bias m/s², band 1σ", "/bias/accel"), ("Gyroscope bias rad/s, band 1σ", "/bias/gyro"))
 
 
+# The viewer's vertical opening angle, a picture 1.6 times as wide as high, and the share of it that is filled.
+OPENING_DEG, ASPECT, FILLED = 55.0, 1.6, 0.85
+
+
 def build(
     recorder: Recorder,
     session: Session,
     solution: Solution | None,
     extent: Extent | None,
-    events: Events,
     factor: float,
 ) -> Any:
     """Left the path with report, map and camera; right the signals. `factor` magnifies the ellipsoids of the path."""
     import rerun.blueprint as rrb
 
     left = _stack([_tabs(_scenes(recorder, extent, factor)), _row(_flat_views(recorder, session, extent))], [3, 2])
-    right = _right(recorder, solution, events)
+    right = _right(recorder, solution)
     sides = [side for side in (left, right) if side is not None]
     return rrb.Blueprint(
         rrb.Horizontal(*sides, column_shares=[3, 2][: len(sides)]),
@@ -88,14 +93,14 @@ def _scenes(recorder: Recorder, extent: Extent | None, factor: float) -> list[An
         name = "Path (ENU)"
         if recorder.has("/world/est/covariances"):
             name += f", 3σ ellipsoids ×{factor:g}"
-        eye = extent.centre + extent.size * np.array([-0.45, -0.75, 0.7])
-        views.append(_world(name, extent, eye, [0.0, 0.0, 1.0]))
+        views.append(_world(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
     if recorder.has("/report"):
         views.append(rrb.TextDocumentView(name="Report", origin="/report"))
     return views
 
 
-def _world(name: str, extent: Extent, eye: Any, up: list[float]) -> Any:
+def _world(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
+    """The scene looked at along `direction` from where everything is in the picture."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -109,8 +114,24 @@ def _world(name: str, extent: Extent, eye: Any, up: list[float]) -> Any:
             plane=rr.components.Plane3D.XY.with_distance(extent.floor),
             color=[255, 255, 255, 40],
         ),
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=extent.centre, eye_up=up),
+        eye_controls=rrb.EyeControls3D(
+            position=eye_position(extent, direction, np.array(up)), look_target=extent.centre, eye_up=up
+        ),
     )
+
+
+def eye_position(extent: Extent, direction: Floats, up: Floats) -> Floats:
+    """Nearest eye (3,) on the line through the centre along `direction` that has every point in the picture.
+
+    A point (x, y, z) right of, above and behind the centre is inside where |x| <= a (d + z) and |y| <= b (d + z), with
+    d the eye's distance and a, b the tangents of half the opening angles: d is the largest |x| / a - z, |y| / b - z.
+    """
+    ahead = direction / np.linalg.norm(direction)
+    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+    x, y, z = np.stack([right, np.cross(right, ahead), ahead]) @ (extent.points - extent.shift - extent.centre).T
+    half = np.tan(np.radians(0.5 * OPENING_DEG)) * FILLED
+    distance = max(float((np.abs(x) / (half * ASPECT) - z).max()), float((np.abs(y) / half - z).max()))
+    return np.asarray(extent.centre - ahead * max(distance, 0.5 * extent.size))
 
 
 def _flat_views(recorder: Recorder, session: Session, extent: Extent | None) -> list[Any]:
@@ -120,67 +141,82 @@ def _flat_views(recorder: Recorder, session: Session, extent: Extent | None) -> 
     if recorder.has("/geo") and extent is not None:
         views.append(_map(session, extent))
     elif recorder.has("/world") and extent is not None:
-        above = extent.centre + np.array([0.0, -1e-3 * extent.size, 1.1 * extent.size])
-        views.append(_world("Top view (ENU)", extent, above, [0.0, 1.0, 0.0]))
+        views.append(_world("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
     cameras = sorted({path.split("/")[2] for path in recorder.paths if path.startswith("/camera/")})
     for camera in cameras:
         origin = f"/camera/{camera}"
         views.append(rrb.Spatial2DView(name=f"Camera {camera}", origin=origin, contents=[f"{origin}/**"]))
     if recorder.has("/tracks") and session.tracks is not None:
-        low, high = session.tracks.xy_n.min(axis=0), session.tracks.xy_n.max(axis=0)
-        margin = 0.05 * (high - low) + 1e-3
-        bounds = rrb.VisualBounds2D(
-            x_range=[low[0] - margin[0], high[0] + margin[0]], y_range=[low[1] - margin[1], high[1] + margin[1]]
-        )
-        views.append(rrb.Spatial2DView(name="Tracks (normalised)", origin="/tracks", visual_bounds=bounds))
+        views.append(_tracks(session.tracks.xy_n))
     return views
 
 
+def _tracks(xy_n: Floats) -> Any:
+    """Normalised image coordinates, with the last half second as a trail."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    low, high = xy_n.min(axis=0), xy_n.max(axis=0)
+    (left, top), (right, bottom) = low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3
+    cursor = rr.TimeRangeBoundary.cursor_relative
+    return rrb.Spatial2DView(
+        name="Tracks (normalised)",
+        origin="/tracks",
+        visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
+        time_ranges=[
+            rrb.VisibleTimeRange(timeline, start=cursor(seconds=-0.5), end=cursor(seconds=0.0))
+            for timeline in ("elapsed", "utc", "device")
+        ],
+    )
+
+
 def _map(session: Session, extent: Extent) -> Any:
-    """Zoom so that the path fills most of a map some 400 points wide (256-point tiles, Web Mercator)."""
+    """Zoom so that the path fills most of a map 800 by 260 points (256-point tiles, Web Mercator)."""
     import rerun.blueprint as rrb
 
     assert session.origin is not None
-    metres_a_point = extent.size / 300.0
+    width, height = (extent.high - extent.low)[:2]
+    metres_a_point = max(width / 800.0, height / 260.0, 1e-3)
     earth = 40_075_017.0 * float(np.cos(np.radians(session.origin.lat_deg)))
     zoom = float(np.clip(np.log2(earth / 256.0 / metres_a_point), 1.0, 19.0))
     return rrb.MapView(name="Map", origin="/geo", zoom=zoom, background=rrb.MapProvider.OpenStreetMap)
 
 
-def _right(recorder: Recorder, solution: Solution | None, events: Events) -> Any:
+def _right(recorder: Recorder, solution: Solution | None) -> Any:
     import rerun.blueprint as rrb
 
     def series(names: tuple[tuple[str, str], ...]) -> list[Any]:
-        return [_series(name, [path], events) for name, path in names if recorder.has(path)]
+        return [_series(name, [path], limits=recorder.limits.get(path)) for name, path in names if recorder.has(path)]
 
     raw = series(_SIGNALS)
     # Without a solution there is room to show every signal at once.
     signals_part = _tabs(raw) if solution is not None else _stack(raw, [2.0] * len(raw))
-    states = rrb.StateTimelineView(name="States", origin="/status") if recorder.has("/status") else None
-    log = rrb.TextLogView(name="Log", origin="/log") if recorder.has("/log") else None
+    states = (
+        rrb.StateTimelineView(name="States", origin="/status", time_view=_whole()) if recorder.has("/status") else None
+    )
+    log = rrb.TextLogView(name="Log", origin="/log", columns=_log_columns()) if recorder.has("/log") else None
     count = 2.0 if solution is not None else 2.0 * max(1, len(raw))
     return _stack(
         [
             signals_part,
             _tabs(series(_ACCURACY)),
             _tabs(series(_BIASES)),
-            _tabs(_residuals(solution, events)),
+            _tabs(_residuals(solution)),
             states,
             log,
         ],
-        [count, 2.0, 2.0, 2.0, 1.6, 1.6],
+        [count, 2.0, 2.0, 2.0, 1.9, 1.9],
     )
 
 
-def _residuals(solution: Solution | None, events: Events) -> list[Any]:
+def _residuals(solution: Solution | None) -> list[Any]:
     if solution is None:
         return []
     sensors = signals.sensors_of(solution.residuals)
     # Position sensors tell most: they stand first; the inertial residuals are many and small.
     sensors.sort(key=lambda name: (name == "imu", name == "prior", name))
     return [
-        _series(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], events, legend=_few(solution, name))
-        for name in sensors
+        _series(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], legend=_few(solution, name)) for name in sensors
     ]
 
 
@@ -188,19 +224,40 @@ def _few(solution: Solution, sensor: str) -> bool:
     return int(solution.residuals.axis[solution.residuals.of(sensor)].max()) < 6
 
 
-def _series(name: str, contents: list[str], events: Events, *, legend: bool = True) -> Any:
-    import rerun as rr
+def _series(
+    name: str,
+    contents: list[str],
+    *,
+    legend: bool = True,
+    limits: tuple[float, float] | None = None,
+) -> Any:
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
         name=name,
         origin="/",
         contents=contents,
-        axis_x=rrb.TimeAxis(
-            view_range=rr.TimeRange(
-                start=rr.TimeRangeBoundary.absolute(nanos=0),
-                end=rr.TimeRangeBoundary.absolute(nanos=events.end_ns - events.start_ns),
-            )
-        ),
+        axis_x=_whole(),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
     )
+
+
+def _log_columns() -> Any:
+    """Time, level and text: all lines come from one entity."""
+    from rerun.blueprint.archetypes import TextLogColumns
+    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+    return TextLogColumns(
+        timeline_columns=[TimelineColumn("elapsed")],
+        text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+    )
+
+
+def _whole() -> Any:
+    """The whole recording, on whichever time line is chosen."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    end = rr.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=end, end=end))

@@ -26,6 +26,7 @@ class Events:
     fix_use (n_fixes,): USED, REJECTED, or WITHHELD (it has no residual: kept back, or outside the solution).
     """
 
+    t0_ns: int
     start_ns: int
     end_ns: int
     gaps: list[Gap]
@@ -41,6 +42,7 @@ def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]
     fixes = session.gnss.t_ns[use == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
     static = session.static
     return Events(
+        t0_ns=session.t0_ns,
         start_ns=start,
         end_ns=end,
         gaps=imu_gaps(session, summary),

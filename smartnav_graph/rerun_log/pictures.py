@@ -25,7 +25,7 @@ def log_images(recorder: Recorder, session: Session, end_ns: int) -> list[str]:
         return []
     told: list[str] = []
     for camera in sorted({str(name) for name in session.images.camera}):
-        mine = np.flatnonzero(session.images.camera == camera)
+        mine = np.flatnonzero((session.images.camera == camera) & (session.images.file != ""))
         found = [(int(i), session.path / "images" / str(session.images.file[i])) for i in mine]
         there = [(i, file) for i, file in found if file.suffix.lower() in MEDIA_TYPES and file.is_file()]
         step = max(1, -(-sum(file.stat().st_size for _, file in there) // IMAGE_BYTES))

@@ -68,11 +68,15 @@ class Clock:
 
 @dataclass
 class Recorder:
-    """Writes columns and static data, and remembers the entities, so that the blueprint shows only what is there."""
+    """Writes columns and static data, and remembers the entities, so that the blueprint shows only what is there.
+
+    `limits` keeps a plot's value range where the viewer's own choice would cut off the bands.
+    """
 
     stream: Any
     clock: Clock
     paths: set[str] = field(default_factory=set)
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def static(self, path: str, *archetypes: Any) -> None:
         """Data that holds at all times."""

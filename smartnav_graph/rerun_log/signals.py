@@ -61,13 +61,17 @@ def _log_bands(
     unit: str,
     keyframe: NDArray[Any] | None,
 ) -> None:
-    """Three lines with bands of one sigma."""
+    """Lines with bands of one sigma."""
     import rerun as rr
 
     columns = rr.Measurements.columns(values=values, variances=sigmas**2)
     recorder.rows(path, t_ns, columns, keyframe)
     style = rr.Measurements.from_fields(names=names, units=[unit] * len(names), colors=colours.AXES[: len(names)])
     recorder.style(path, style)
+    low, high = np.nanpercentile(values - sigmas, 0.5), np.nanpercentile(values + sigmas, 99.5)
+    if np.isfinite([low, high]).all() and high > low:
+        margin = 0.05 * (high - low)
+        recorder.limits[path] = (float(low - margin), float(high + margin))
 
 
 def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -> None:
@@ -128,7 +132,7 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
         for path, used in ((f"/residuals/{sensor}", True), (f"/residuals/{sensor}/rejected", False)):
             t, table = residual_rows(residuals, sensor, used)
             width = table.shape[1]
-            names = [f"{axis_name(k, width)}{'' if used else ' rejected'}" for k in range(width)]
+            names = [axis_name(k, width) if used else "rejected" for k in range(width)]
             recorder.rows(path, t, rr.Scalars.columns(scalars=table))
             if len(t):
                 style = rr.SeriesPoints(

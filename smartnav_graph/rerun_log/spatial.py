@@ -24,15 +24,16 @@ ELLIPSOID_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Extent:
-    """Box of the paths in nav metres: `low`, `high` (3,). `shift` (3,) is taken off everything drawn.
+    """Box of the path in nav metres: `low`, `high` (3,), with some of its `points` (n, 3).
 
-    The viewer keeps positions as 32-bit floats: far from the origin (projected coordinates of a session without
-    origin) they would lose decimetres, so that whole kilometres are taken off.
+    `shift` (3,) is taken off everything drawn. The viewer keeps positions as 32-bit floats: far from the origin
+    (projected coordinates of a session without origin) they would lose decimetres, so whole kilometres are taken off.
     """
 
     low: Floats
     high: Floats
     shift: Floats
+    points: Floats
 
     @property
     def size(self) -> float:
@@ -65,7 +66,7 @@ def extent_of(session: Session, solution: Solution | None, causal: Solution | No
             low, high = points.min(axis=0), points.max(axis=0)
             centre = (low + high) / 2
             shift = np.round(centre, -3) if np.abs(centre).max() > 20_000.0 else np.zeros(3)
-            return Extent(low, high, shift)
+            return Extent(low, high, shift, thinned(points, 2000))
     return None
 
 
@@ -143,7 +144,7 @@ class Scene:
 
 def log_solution(scene: Scene, solution: Solution) -> float:
     """Path, moving body with axes and velocity, covariance ellipsoids; the magnification of those along the path."""
-    scene.path("est", solution.nav_t_body, colours.ESTIMATE, 2.0)
+    scene.path("est", solution.nav_t_body, colours.ESTIMATE, 2.5)
     good = np.isfinite(solution.nav_t_body).all(axis=1) & np.isfinite(solution.nav_R_body).all(axis=(1, 2))
     rows = np.flatnonzero(good)
     if not len(rows):
