@@ -158,7 +158,7 @@ def _missing(session: Session) -> tuple[str, ...]:
 def quiet_accel(imu: Imu) -> float | None:
     """Median |accel| (m/s^2) of the quiet half seconds; None when the device is never quiet.
 
-    Quiet: on every axis accel varies by less than 0.3 m/s^2 and gyro by less than 0.05 rad/s (standard deviations),
+    Quiet: on every axis accel varies by less than 0.4 m/s^2 and gyro by less than 0.05 rad/s (standard deviations),
     several times the noise of a phone at rest and less than any step or engine under load.
     """
     width = max(3, round(0.5 / _period(imu)))
@@ -170,7 +170,7 @@ def quiet_accel(imu: Imu) -> float | None:
         mean = uniform_filter1d(centred, width, axis=0)
         return np.asarray(np.sqrt(np.maximum(uniform_filter1d(centred**2, width, axis=0) - mean**2, 0.0)).max(axis=1))
 
-    quiet = (spread(imu.accel) < 0.3) & (spread(imu.gyro) < 0.05)
+    quiet = (spread(imu.accel) < 0.4) & (spread(imu.gyro) < 0.05)
     return float(np.median(np.linalg.norm(imu.accel[quiet], axis=1))) if quiet.sum() >= width else None
 
 
@@ -215,9 +215,13 @@ def _gaps(facts: Facts) -> Iterator[Finding]:
         gaps = [gap for gap in facts.gaps if gap.kind == kind]
         if gaps:
             total, longest = sum(gap.length_s for gap in gaps), max(gaps, key=lambda gap: gap.length_s)
-            at = float(facts.session.seconds(longest.start_ns))
-            text = f"{len(gaps)} stretches {what}, {total:.2f} s in all, longest {longest.length_s:.2f} s at {at:.2f} s"
+            at, count = float(facts.session.seconds(longest.start_ns)), _count(len(gaps), "stretch", "es")
+            text = f"{count} {what}, {total:.2f} s in all, longest {longest.length_s:.2f} s at {at:.2f} s"
             yield Finding("warning", "imu", text, "the uncertainty grows there; fixes around them help")
+
+
+def _count(n: int, noun: str, plural: str = "s") -> str:
+    return f"{n} {noun}{'' if n == 1 else plural}"
 
 
 def _constant(facts: Facts) -> Iterator[Finding]:
@@ -360,7 +364,7 @@ def _jumps(facts: Facts) -> Iterator[Finding]:
         jump = np.linalg.norm(np.diff(position, axis=0), axis=1) > allowed
         if jump.any():
             at = float(facts.session.seconds(stream.t_ns[1:][jump][0]))
-            text = f"{int(jump.sum())} jumps faster than {_MAX_FIX_SPEED:g} m/s, the first at {at:.3f} s"
+            text = f"{_count(int(jump.sum()), 'jump')} faster than {_MAX_FIX_SPEED:g} m/s, the first at {at:.3f} s"
             yield Finding("warning", name, text, "keep a robust loss on, or remove the outliers")
 
 

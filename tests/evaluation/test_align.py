@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph.errors import SessionError
 from smartnav_graph.evaluation import evaluate
 from smartnav_graph.evaluation.align import fit, track_of_solution
-from smartnav_graph.timebase import NS
+from smartnav_graph.solution import Solution
+from smartnav_graph.streams import Reference
+from smartnav_graph.timebase import NS, ns_from_seconds, ns_from_texts
 
 
 def moved(solution, R, t, scale=1.0):
@@ -118,3 +122,38 @@ def test_fit_agrees_with_a_numerical_minimum():
     best = grid[np.argmin([cost(psi) for psi in grid])]
     psi = np.arctan2(found.R[1, 0], found.R[0, 0])
     assert psi == pytest.approx(best, abs=2e-3)
+
+
+DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).parents[3] / "shared" / "datasets"))
+
+
+@pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no real recordings at {DATASETS} (SMARTNAV_DATASETS)")
+def test_real_clocks_and_frames_are_matched_by_themselves():
+    """KITTI: the positions of the gtsam wheel against the camera poses, which count time from their first frame.
+
+    An independent fit puts frame 0 at 46534.94 s and finds the scale 0.9981 (reference to fixes).
+    """
+    import gtsam
+
+    file = gtsam.findExampleDataFile("KittiGps_converted.txt")
+    enu = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(1, 2, 3))
+    n = len(enu)
+    fixes = Solution(
+        t_ns=ns_from_texts([line.split(",")[0] for line in Path(file).read_text().splitlines()[1:]]),
+        nav_R_body=np.repeat(np.eye(3)[None], n, axis=0),
+        nav_t_body=enu,
+        nav_v_body=np.zeros((n, 3)),
+        accel_bias=np.zeros((n, 3)),
+        gyro_bias=np.zeros((n, 3)),
+        covariance=np.repeat(np.eye(15)[None], n, axis=0),
+        t0_ns=46_534_478_375_790,
+    )
+    folder = DATASETS / "kitti00_reference"
+    poses = np.loadtxt(folder / "poses_00.txt").reshape(-1, 3, 4)
+    cam_t_imu = [-0.32, 0.72, -1.11]  # m, near enough for the position of the IMU
+    reference = Reference(t_ns=ns_from_seconds(np.loadtxt(folder / "times.txt")), enu=poses @ np.r_[cam_t_imu, 1.0])
+    result = evaluate(fixes, reference, align="sim3", time_offset_s="auto")
+    assert result.time_offset_s == pytest.approx(46534.94, abs=0.01)  # s
+    assert result.alignment.scale == pytest.approx(1 / 0.9981, abs=3e-4)
+    assert result.ape_m.p50 < 0.15  # m; linear interpolation over 1 s
+    assert result.matched == 4539 and result.unmatched == 2
