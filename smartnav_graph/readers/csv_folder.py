@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from smartnav_graph.session import Session, read_header
 from smartnav_graph.streams import STREAMS, Stream
 
 NAME = "csv"
+
+_log = logging.getLogger(__name__)
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -40,9 +43,12 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
 
 
 def _columns(kind: type[Stream], table: TextTable) -> Columns:
-    """Every column by its kind. A wholly empty optional column is one that is not there."""
+    """Every column by its kind. A wholly empty optional column is one that is not there; unknown ones are told."""
     kinds = {name: spec.metadata["kind"] for spec in kind.specs() for name in spec.metadata["columns"]}
     optional = {name for spec in kind.specs() if spec.default is None for name in spec.metadata["columns"]}
+    unknown = ", ".join(name for name in table.cells if name not in kinds)
+    if unknown:
+        _log.warning("%s: unknown column %s; kept, but not used", table.path, unknown)
     columns: Columns = {}
     for name in table.cells:
         if name in optional and table.is_empty(name):
