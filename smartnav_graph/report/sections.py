@@ -189,6 +189,7 @@ def against_reference(evaluation: Any, compared: Summary, solution: Solution, ga
     horizontal: NDArray[Any] = np.zeros(0) if error is None else np.linalg.norm(np.asarray(error)[:, :2], axis=1)
     tables = [facts.evaluation_table(compared), facts.relative_table(compared), facts.nees_table(compared)]
     body = f"<p>{escape(facts.evaluation_sentence(compared))}</p>" + "".join(t.html() for t in tables if t)
+    body += "".join(f'<p class="fine">{escape(str(note))}</p>' for note in getattr(evaluation, "notes", ()))
     body += charts.distribution(horizontal, "errors against the reference")
     if len(solution) > 1:
         body += charts.errors_over_time(evaluation, solution, gaps)

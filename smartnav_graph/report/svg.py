@@ -20,18 +20,24 @@ from smartnav_graph.report.thin import thin_band, thin_line
 Floats = NDArray[np.float64]
 
 UNITS = 10000
+LONGEST = 7
 TIME_STEPS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 43200, 86400)
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Range `lo` .. `hi` in data units with labelled ticks."""
+    """Range `lo` .. `hi` in data units with labelled ticks; labels tell the value less `offset`."""
 
     lo: float
     hi: float
     ticks: tuple[float, ...]
     labels: tuple[str, ...]
     log: bool = False
+    offset: float = 0.0
+
+    def titled(self, title: str) -> str:
+        """The title of the axis, with the offset of its labels."""
+        return f"{title}, less {fixed(self.offset, 3).rstrip('0').rstrip('.')}" if self.offset and title else title
 
     def fraction(self, values: ArrayLike) -> Floats:
         """Position of `values` along the axis, 0 at `lo`, 1 at `hi`."""
@@ -54,12 +60,23 @@ def round_step(span: float, at_most: int) -> float:
     return scale * next(m for m in (1, 2, 5, 10) if m * scale >= raw * (1 - 1e-9))
 
 
-def ticks_between(lo: float, hi: float, step: float) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Multiples of `step` inside [lo, hi], with labels of just enough decimals."""
+def ticked(lo: float, hi: float, step: float) -> Axis:
+    """Axis with ticks at the multiples of `step` inside [lo, hi], and labels of just enough decimals.
+
+    Labels of more than `LONGEST` characters are told less a round offset, or else with a power of ten.
+    """
     first, last = math.ceil(lo / step - 1e-9), math.floor(hi / step + 1e-9)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     values = tuple(i * step for i in range(first, last + 1))
-    return values, tuple(fixed(v, decimals) for v in values)
+    labels = tuple(fixed(v, decimals) for v in values)
+    if max(map(len, labels), default=0) <= LONGEST:
+        return Axis(lo, hi, values, labels)
+    power = 10.0 ** math.ceil(math.log10(hi - lo))
+    offset = math.floor(lo / power) * power
+    labels = tuple(fixed(v - offset, decimals) for v in values)
+    if max(map(len, labels)) <= LONGEST:
+        return Axis(lo, hi, values, labels, offset=offset)
+    return Axis(lo, hi, values, tuple(f"{v:.3g}".replace("e+0", "e").replace("-", "−") for v in values))
 
 
 def axis(values: ArrayLike, *, count: int = 5, include: Iterable[float] = (), least: float = 0.0) -> Axis:
@@ -72,13 +89,13 @@ def axis(values: ArrayLike, *, count: int = 5, include: Iterable[float] = (), le
         lo, hi = middle - span / 2, middle + span / 2
     step = round_step(span, count)
     lo, hi = math.floor(lo / step + 1e-9) * step, math.ceil(hi / step - 1e-9) * step
-    return Axis(lo, hi, *ticks_between(lo, hi, step))
+    return ticked(lo, hi, step)
 
 
 def exact_axis(lo: float, hi: float, *, count: int = 6, step: float | None = None) -> Axis:
     """Linear axis from `lo` to `hi` as given; round ticks inside."""
     hi = hi if hi > lo else lo + 1.0
-    return Axis(lo, hi, *ticks_between(lo, hi, step or round_step(hi - lo, count)))
+    return ticked(lo, hi, step or round_step(hi - lo, count))
 
 
 def time_axis(lo: float, hi: float, count: int = 12) -> Axis:
@@ -98,8 +115,14 @@ def log_axis(values: ArrayLike) -> Axis:
     low = max(t for t in ladder if t <= lo * (1 + 1e-9))
     high = min(t for t in ladder if t >= hi * (1 - 1e-9) and t > low)
     ticks = tuple(t for t in ladder if low * (1 - 1e-9) <= t <= high * (1 + 1e-9))
-    labels = tuple(fixed(t, max(0, -math.floor(math.log10(t) + 1e-9))) for t in ticks)
-    return Axis(low, high, ticks, labels, log=True)
+    return Axis(low, high, ticks, tuple(map(_log_label, ticks)), log=True)
+
+
+def _log_label(tick: float) -> str:
+    power = math.floor(math.log10(tick) + 1e-9)
+    if -5 < power < 5:
+        return fixed(tick, max(0, -power))
+    return f"{tick / 10.0**power:.0f}e{power}".replace("-", "−")
 
 
 def spread_axis(values: ArrayLike, *, least: float = 0.0) -> Axis:
@@ -226,9 +249,13 @@ class Plot:
         """The ``<svg>`` element."""
         size = f"aspect-ratio:{self.aspect:.4f}" if self.aspect else f"height:{self.height_px}px"
         kind = "plot" if self.x_title else "plot above"
-        titles = f'<text class="title ty0" x="-48" y="-13">{escape(self.y_title)}</text>' if self.y_title else ""
+        titles = (
+            f'<text class="title ty0" x="-48" y="-13">{escape(self.y.titled(self.y_title))}</text>'
+            if self.y_title
+            else ""
+        )
         if self.x_title:
-            titles += f'<text class="title tx0" x="100%" y="100%" dy="37">{escape(self.x_title)}</text>'
+            titles += f'<text class="title tx0" x="100%" y="100%" dy="37">{escape(self.x.titled(self.x_title))}</text>'
         return (
             f'<svg class="{kind}" style="{size}" role="img" aria-label="{escape(self.label)}">'
             f'<svg class="box" viewBox="0 0 {UNITS} {self._height:.0f}" preserveAspectRatio="none" '

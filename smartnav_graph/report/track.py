@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.report.svg import Axis, Plot, legend, round_step, ticks_between
+from smartnav_graph.report.svg import Axis, Plot, legend, round_step, ticked
 from smartnav_graph.report.text import count, fixed, number
 from smartnav_graph.report.thin import thin_path
 from smartnav_graph.session import Session
@@ -61,8 +61,7 @@ def _axes(points: Floats) -> tuple[Axis, Axis, float]:
     middle, half = (lo + hi) / 2, np.array([width, height]) / 2
     (west, south), (east, north) = middle - half, middle + half
     step = round_step(max(width, height), 9)
-    axes = [Axis(a, b, *ticks_between(a, b, step)) for a, b in ((west, east), (south, north))]
-    return axes[0], axes[1], float(width / height)
+    return ticked(west, east, step), ticked(south, north, step), float(width / height)
 
 
 def draw(

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from drive_case import drive
+
+from smartnav_graph.report import write_report
 
 CHROMIUM = shutil.which("chromium")
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -40,9 +46,31 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
+@pytest.fixture(scope="module")
+def far_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An hour in national grid coordinates, high up, badly known: long labels everywhere."""
+    case = drive(3500)
+    far = np.array([412_345.0, 5_932_101.0, 1234.0])
+    solution = replace(
+        case.solution, nav_t_body=case.solution.nav_t_body + far, covariance=case.solution.covariance * 1e9, origin=None
+    )
+    path = tmp_path_factory.mktemp("far") / "report.html"
+    write_report(path, session=case.session.replace(gnss=None), solution=solution, summary=case.summary)
+    return path
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_long_labels(browser: Any, far_page: Path, width: int) -> None:
+    look(browser, far_page, width, "light")
+
+
 @pytest.mark.parametrize("width", [1400, 390])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_page(browser: Any, page: Any, width: int, scheme: str) -> None:
+def test_page(browser: Any, page: Path, width: int, scheme: str) -> None:
+    look(browser, page, width, scheme)
+
+
+def look(browser: Any, page: Path, width: int, scheme: str) -> None:
     said: list[str] = []
     asked: list[str] = []
     tab = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)

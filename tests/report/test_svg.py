@@ -44,6 +44,14 @@ def test_time_and_log_ticks_are_what_people_expect() -> None:
     assert spread_axis([0.1, 0.2]).log is False and spread_axis([0.1, 20.0]).log is True
 
 
+def test_long_labels_are_told_less_an_offset_or_by_powers() -> None:
+    high = axis([1234.551, 1234.598])
+    assert high.offset == pytest.approx(1234.5) and high.labels[0] == "0.05"
+    assert high.titled("Height [m]") == "Height [m], less 1\u202f234.5"
+    assert axis([-4e6, 5e6]).labels == ("−4e6", "−2e6", "0", "2e6", "4e6", "6e6")
+    assert log_axis([3e-7, 2e6]).labels[0] == "1e−7"
+
+
 def test_line_is_drawn_where_the_data_are() -> None:
     plot = Plot(exact_axis(0.0, 10.0), exact_axis(0.0, 5.0), "test")
     plot.line([0.0, 5.0, 10.0], [0.0, np.nan, 5.0], "s0")
