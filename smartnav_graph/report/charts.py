@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -17,6 +17,7 @@ from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
 
 Floats = NDArray[np.float64]
 Intervals = Sequence[tuple[float, float]]
+Scored = Mapping[str, tuple[NDArray[np.int64], Floats]]
 
 AXES = ("East", "North", "Up")
 MOST_FAR = 6.0  # whitened residuals beyond are drawn at the edge and counted
@@ -216,6 +217,21 @@ def distribution(errors: ArrayLike, what: str) -> str:
             dy=15 if right else -7,
         )
     return figure([plot], note=f"{count(len(e))} {what}.")
+
+
+def withheld(name: str, t_ns: NDArray[np.int64], error: Floats, solution: Solution, gaps: Intervals) -> str:
+    """Horizontal errors at withheld measurements: their distribution, and over time beside the estimated sigma."""
+    horizontal = np.linalg.norm(np.asarray(error, dtype=np.float64)[:, :2], axis=1)
+    picture = distribution(horizontal, f"withheld {sensor_name(name)} measurements")
+    if len(solution) < 2 or not len(finite(horizontal)):
+        return picture
+    sigma = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)
+    y = axis(np.concatenate([horizontal, finite(sigma)]), include=(0.0,))
+    plot = _over_time(solution, y, "Horizontal error [m]", gaps)
+    plot.line(solution.seconds, sigma, "s3")
+    plot.dots((np.asarray(t_ns) - solution.t0_ns) / 1e9, horizontal, "held")
+    marks = [("dots held", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *_shaded(gaps)]
+    return picture + figure([plot], marks)
 
 
 def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> str:

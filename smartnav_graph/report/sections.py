@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.report import charts, facts, statistics, track
-from smartnav_graph.report.text import as_float, attributes, capital, fixed
+from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
 
@@ -36,7 +36,14 @@ TEMPLATE = """<!doctype html>
 """
 
 
-def page(session: Session, solution: Solution, summary: Summary, evaluation: Any, causal: Solution | None) -> str:
+def page(
+    session: Session,
+    solution: Solution,
+    summary: Summary,
+    evaluation: Any,
+    causal: Solution | None,
+    scored: charts.Scored,
+) -> str:
     """The whole HTML text."""
     holes = facts.gaps(summary)
     shaded = [(start, start + length) for start, length, _ in holes]
@@ -49,7 +56,7 @@ def page(session: Session, solution: Solution, summary: Summary, evaluation: Any
         used(session, summary),
         imu_holes(summary, holes),
         *over_time(solution, shaded, causal),
-        withheld(summary),
+        withheld(summary, scored, solution, shaded),
         against_reference(evaluation, compared, solution, shaded),
         *machinery(summary),
     ]
@@ -91,8 +98,8 @@ def sigma_sentence(solution: Solution) -> str:
     at = fixed(t, 0 if float(t).is_integer() else 1)
     data = {"t-s": t, "sigma-e-m": e, "sigma-n-m": n, "sigma-u-m": u, "sigma-horizontal-m": horizontal}
     return (
-        f'<p id="sigma-at"{attributes(data)}>At t = {at} s the position is known to {fixed(horizontal, 2)} m '
-        f"(1 sigma, horizontal): {fixed(e, 3)} m east, {fixed(n, 3)} m north, and {fixed(u, 3)} m in height.</p>"
+        f'<p id="sigma-at"{attributes(data)}>At t = {at} s the position is known to {metres(horizontal)} '
+        f"(1 sigma, horizontal): {metres(e)} east, {metres(n)} north, and {metres(u)} in height.</p>"
         '<p class="fine">Horizontal means √(σ<sub>e</sub>² + σ<sub>n</sub>²), as for the errors below. '
         "Seconds count from the first IMU sample.</p>"
     )
@@ -165,19 +172,14 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
     return [*parts, section("residuals", "Residuals", both)]
 
 
-def withheld(summary: Summary) -> str:
+def withheld(summary: Summary, scored: charts.Scored, solution: Solution, gaps: charts.Intervals) -> str:
     """Measurements kept from the estimate and scored against it."""
     table = facts.withheld_table(summary)
     if not table:
         return ""
-    pictures = [
-        charts.distribution(np.asarray(score["errors_horizontal_m"], dtype=np.float64), f"withheld {name} errors")
-        for name, score in facts.room(summary, "withheld").items()
-        if isinstance(score, Mapping) and score.get("errors_horizontal_m") is not None
-    ]
-    data = facts.withheld_counts(summary).values()
+    pictures = [charts.withheld(name, *rows, solution, gaps) for name, rows in scored.items()]
     lead = "<p>These measurements were kept from the estimate, then compared with it.</p>"
-    total = {"count": round(sum(as_float(n) or 0.0 for n in data))}
+    total = {"count": round(sum(as_float(n) or 0.0 for n in facts.withheld_counts(summary).values()))}
     return section("withheld", "Withheld measurements", lead + table.html() + "".join(pictures), total)
 
 

@@ -75,13 +75,14 @@ def draw(
     near = _near(path, fixes)
     x, y, aspect = _axes(np.concatenate([path, near]))
     plot = Plot(x, y, "Map of the trajectory, east and north in metres", "North [m]", "East [m]", aspect=aspect)
+    ellipses = _ellipses(plot, solution)
     entries = _fixes(plot, fixes)
     if causal is not None and len(causal) > 1:
         _way(plot, causal.nav_t_body[:, :2], "line causal")
         entries.append(("line causal", "Estimate while replaying (causal)"))
     _way(plot, path, "line way")
     entries = [("line way", "Smoothed path"), *entries]
-    entries += _gaps(plot, solution, gaps) + _ellipses(plot, solution)
+    entries += _gaps(plot, solution, gaps) + ellipses
     _ends(plot, path)
     _furniture(plot, path)
     widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
@@ -140,13 +141,15 @@ def _ellipses(plot: Plot, solution: Solution) -> list[tuple[str, str]]:
     wanted = 0.018 * (plot.x.hi - plot.x.lo)
     typical = max(float(np.median(axes[:, 1])), float(axes[:, 1].max()) / 4)
     scale = max(1.0, round_step(wanted / typical, 1)) if typical > 0 else 1.0
+    fits = scale * axes[:, 1] < (plot.x.hi - plot.x.lo) / 3
     angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    for i, half, turn in zip(chosen, axes, vector, strict=True):
+    for i, half, turn in zip(chosen[fits], axes[fits], vector[fits], strict=True):
         ring = solution.nav_t_body[i, :2, None] + scale * (turn * half) @ circle
         plot.area(ring[0], ring[1], "ellipse")
     size = f"enlarged {fixed(scale, 0)}×" if scale > 1 else "true size"
-    return [("ellipse", f"1 sigma ellipse, {size}")]
+    wide = f"; {count((~fits).sum())} too large for this map" if not fits.all() else ""
+    return [("ellipse", f"1 sigma ellipse, {size}{wide}")]
 
 
 def _spaced(solution: Solution) -> NDArray[np.intp]:

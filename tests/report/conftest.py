@@ -24,5 +24,6 @@ def page(case: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
         summary=case.summary,
         evaluation=case.evaluation,
         causal=case.causal,
+        withheld=case.withheld,
     )
     return path

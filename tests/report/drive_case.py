@@ -25,6 +25,7 @@ class Drive:
     causal: Solution
     summary: dict[str, Any]
     evaluation: Any
+    withheld: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,14 @@ def drive(n: int = 470) -> Drive:
         forward="+x",
         residuals=_residuals(t, rng),
     )
-    return Drive(_session(solution, rng), solution, _causal(solution, rng), summary(n), _compared(solution, rng))
+    return Drive(
+        _session(solution, rng),
+        solution,
+        _causal(solution, rng),
+        summary(n),
+        _compared(solution, rng),
+        _withheld(solution, rng),
+    )
 
 
 def _residuals(t: np.ndarray, rng: np.random.Generator) -> Residuals:
@@ -130,6 +138,11 @@ def _causal(solution: Solution, rng: np.random.Generator) -> Solution:
 
     wander = np.cumsum(rng.normal(size=(len(solution), 3)), axis=0) * 0.25
     return replace(solution, nav_t_body=solution.nav_t_body + wander, covariance=solution.covariance * 6.0)
+
+
+def _withheld(solution: Solution, rng: np.random.Generator) -> dict[str, Any]:
+    rows = slice(1, None, 2)
+    return {"gnss": (solution.t_ns[rows], rng.normal(size=(len(solution), 3))[rows] * 0.2)}
 
 
 def _compared(solution: Solution, rng: np.random.Generator) -> Compared:

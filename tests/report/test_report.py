@@ -50,7 +50,7 @@ def test_position_sigma_at_300_s_is_that_of_the_covariance(dom, case) -> None:
     assert float(node.get("data-t-s")) == 300.0
     assert float(node.get("data-sigma-e-m")) == pytest.approx(e, rel=1e-9)
     assert float(node.get("data-sigma-horizontal-m")) == pytest.approx(np.hypot(e, n), rel=1e-9)
-    assert f"At t = 300 s the position is known to {np.hypot(e, n):.2f} m (1 sigma, horizontal)" in words(node)
+    assert f"At t = 300 s the position is known to {np.hypot(e, n):.3f} m (1 sigma, horizontal)" in words(node)
 
 
 def test_short_run_tells_its_middle(tmp_path) -> None:
@@ -78,6 +78,13 @@ def test_used_rejected_dropped_withheld(dom) -> None:
     assert [words(c) for c in row] == ["GNSS", "470", "231", "4", "235", "2", "1.11"]
     (row,) = section(dom, "withheld").xpath(".//tr[@data-withheld]")
     assert (row.get("data-withheld"), row.get("data-rms-horizontal-m")) == ("235", "0.284")
+
+
+def test_withheld_errors_are_shown_one_by_one(dom, case) -> None:
+    horizontal = np.linalg.norm(case.withheld["gnss"][1][:, :2], axis=1)
+    assert f"95 %: {np.percentile(horizontal, 95):.3f} m" in words(section(dom, "withheld"))
+    (dots,) = section(dom, "withheld").xpath('.//svg[@class="box"]/path[contains(@class, "held")]/@d')
+    assert dots.count("M") == len(horizontal)
 
 
 def test_map_marks_the_rejected_fixes_where_they_are(dom, case) -> None:
