@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
@@ -49,7 +50,6 @@ def page(
     shaded = [(start, start + length) for start, length, _ in holes]
     compared = facts.evaluation_facts(evaluation)
     parts = [
-        head(session, solution, summary),
         warnings(summary),
         section("map", "Trajectory", track.draw(session, solution, holes, causal)),
         section("statistics", "The run in figures", statistics.table(session, solution, summary).html()),
@@ -60,9 +60,11 @@ def page(
         against_reference(evaluation, compared, solution, shaded),
         *machinery(summary),
     ]
+    body = "\n".join(part for part in parts if part)
+    body = head(session, solution, summary) + contents(body) + body
     name = session.path.name if session.path else session.device.name
     style = files("smartnav_graph.report").joinpath("style.css").read_text(encoding="utf-8")
-    return TEMPLATE.format(title=escape(f"{name}: run report"), style=style, body="\n".join(p for p in parts if p))
+    return TEMPLATE.format(title=escape(f"{name}: run report"), style=style, body=body)
 
 
 def section(name: str, title: str, body: str, data: Mapping[str, Any] | None = None) -> str:
@@ -70,6 +72,13 @@ def section(name: str, title: str, body: str, data: Mapping[str, Any] | None = N
     if not body:
         return ""
     return f'<section id="{name}"{attributes(data or {})}><h2>{escape(title)}</h2>{body}</section>'
+
+
+def contents(body: str) -> str:
+    """Links to the sections that are there."""
+    found = re.findall(r'<section id="([a-z-]+)"[^>]*><h2>([^<]+)</h2>', body)
+    links = "".join(f'<a href="#{name}">{title}</a>' for name, title in found)
+    return f'<nav aria-label="Contents">{links}</nav>'
 
 
 def head(session: Session, solution: Solution, summary: Summary) -> str:

@@ -44,9 +44,11 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def metres(value: Any) -> str:
-    """A small length: three figures, at least to the millimetre and at most to 0.1 mm."""
+    """A small length: to the millimetre below 1 m (to 0.1 mm below 1 cm), else three figures."""
     v = as_float(value)
-    return f"{DASH}" if v is None else f"{fixed(v, 4) if abs(v) < 0.01 else number(v)} m"
+    if v is None:
+        return DASH
+    return f"{fixed(v, 4 if abs(v) < 0.01 else 3) if abs(v) < 1 else number(v)} m"
 
 
 def count(value: Any) -> str:
