@@ -28,7 +28,7 @@ def make_solution(n: int = 40, origin: Origin | None = ORIGIN) -> Solution:
     rng = np.random.default_rng(7)
     t = np.arange(n)
     return Solution(
-        t_ns=T0 + t * 400_000_001,
+        t_ns=T0 + t * 300_000_001,
         nav_R_body=Rotation.from_euler("zyx", 0.1 * rng.normal(size=(n, 3)) + [2.0, 0.0, 0.0]).as_matrix(),
         nav_t_body=np.cumsum(rng.normal(size=(n, 3)), axis=0),
         nav_v_body=rng.normal(size=(n, 3)),

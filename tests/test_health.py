@@ -318,6 +318,17 @@ def test_real_foot_raises_no_alarm(side, up):
 
 
 @real
+@pytest.mark.parametrize("trial", ["2017-12-15-18-01-51", "SensorConnectData_31"])
+def test_real_fast_foot_raises_no_alarm(trial):
+    from scipy.io import loadmat
+
+    data = loadmat(DATASETS / f"foot_pyshoe_vicon/{trial}_LLIO.mat")
+    t = data["timestamps_all" if "timestamps_all" in data else "timestamps"].ravel()
+    rows = data["imu_data"]
+    assert unit_alarms(t, rows[:, 3:6], rows[:, :3], up="-z") == []
+
+
+@real
 @pytest.mark.parametrize("session", ["Jakob_Nexus5_NoDist_Texting", "calib_acc_Nexus5_d1", "calib_mag_Nexus5_d1"])
 def test_real_phone_raises_no_alarm_and_tells_degrees(session):
     folder = DATASETS / "phone_mocap_tyrex/android" / session

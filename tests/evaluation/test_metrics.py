@@ -127,6 +127,20 @@ def test_nees_of_sampled_errors(seconds, scale, inside):
         assert bool(low < result.nees[name] < high) is inside, name
 
 
+def test_attitude_errors_are_weighed_in_nav_axes(seconds):
+    """2 sigma about east, while the device heads east: in body axes it would be 0.2 sigma."""
+    n = len(seconds)
+    heading = Rotation.from_euler("z", 90.0, degrees=True)
+    quat = np.repeat((Rotation.from_rotvec([0.02, 0.0, 0.0]) * heading).as_quat()[None, [3, 0, 1, 2]], n, axis=0)
+    P = np.diag(np.r_[0.01**2, 0.1**2, 0.1**2, np.ones(12)])
+    solution = dataclasses.replace(
+        make_solution(seconds, P), nav_R_body=np.repeat(heading.as_matrix()[None], n, axis=0)
+    )
+    result = evaluate(solution, dataclasses.replace(make_reference(seconds), quat=quat))
+    assert result.nees["attitude"] == pytest.approx(4.0)
+    assert result.nees["yaw"] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_nees_of_sparse_keyframes_is_not_spoilt_by_interpolation():
     keyframes = np.arange(0.0, 60.0, 1.0)
     solution = make_solution(keyframes, 1e-4 * np.eye(15))  # 1 cm
