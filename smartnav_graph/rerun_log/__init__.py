@@ -14,7 +14,7 @@ from typing import Any
 
 from smartnav_graph.files import replacing
 from smartnav_graph.rerun_log import blueprint, colours, events, pictures, signals, spatial, story
-from smartnav_graph.rerun_log.recorder import Clock, Recorder, fingerprint, open_stream
+from smartnav_graph.rerun_log.recorder import Clock, Recorder, fingerprint, recording_file
 from smartnav_graph.rerun_log.viewer import view
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
@@ -59,14 +59,10 @@ def write_recording(
     identity = fingerprint(session.streams(), session.origin, session.dropped, solution, causal, told, report_markdown)
     if evaluation is not None:
         identity = fingerprint(identity, *(getattr(evaluation, name, None) for name in signals.EVALUATION_FIELDS))
-    with replacing(path, force=force) as new:
-        stream = open_stream(new, identity)
+    with replacing(path, force=force) as new, recording_file(new, identity) as stream:
         recorder = Recorder(stream, Clock(session.t0_ns, session.clock_epoch))
-        stream.send_recording_name(f"{session.device.name} {Path(path).stem}")
-        layout = _log_all(recorder, session, solution, causal, evaluation, told, report_markdown)
-        stream.send_blueprint(layout)
-        stream.flush()
-        stream.disconnect()
+        recorder.name(session.device.name, identity)
+        stream.send_blueprint(_log_all(recorder, session, solution, causal, evaluation, told, report_markdown))
 
 
 def _log_all(
@@ -86,7 +82,7 @@ def _log_all(
     if extent is not None:
         factor = _log_scene(recorder, session, solution, causal, extent, found)
         if extent.shift.any():
-            told.append("positions are drawn with east, north, up less {:g}, {:g}, {:g} m".format(*extent.shift))
+            told.append("positions are drawn with east, north, up less {:.0f}, {:.0f}, {:.0f} m".format(*extent.shift))
     signals.log_sensors(recorder, session, found.end_ns)
     if solution is not None:
         signals.log_states(recorder, solution, evaluation)

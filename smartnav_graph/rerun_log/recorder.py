@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -46,9 +48,11 @@ class Clock:
 
     @property
     def is_date(self) -> bool:
-        return self.epoch in ("unix", "gps") and int(self._utc(np.array([self.t0_ns]))[0]) >= _YEAR_2000_NS
+        """Whether the stamps are dates."""
+        return self.epoch in ("unix", "gps") and int(self.utc(np.array([self.t0_ns]))[0]) >= _YEAR_2000_NS
 
-    def _utc(self, t_ns: Times) -> Times:
+    def utc(self, t_ns: Times) -> Times:
+        """Unix nanoseconds of stamps of a unix or gps clock."""
         return utc_from_gps(t_ns) if self.epoch == "gps" else t_ns
 
     def columns(self, t_ns: ArrayLike, keyframe: ArrayLike | None = None) -> list[Any]:
@@ -58,7 +62,7 @@ class Clock:
         t = np.asarray(t_ns, dtype=np.int64)
         columns = [rr.TimeColumn("elapsed", duration=(t - self.t0_ns).astype("timedelta64[ns]"))]
         if self.is_date:
-            columns.append(rr.TimeColumn("utc", timestamp=self._utc(t).astype("datetime64[ns]")))
+            columns.append(rr.TimeColumn("utc", timestamp=self.utc(t).astype("datetime64[ns]")))
         else:
             columns.append(rr.TimeColumn("device", duration=t.astype("timedelta64[ns]")))
         if keyframe is not None:
@@ -93,6 +97,11 @@ class Recorder:
             self.stream.send_columns(path, self.clock.columns(t_ns, keyframe), columns, strict=True)
             self.paths.add(path)
 
+    def name(self, device: str, identity: str) -> None:
+        """What the viewer lists the recording as: device, date where the clock is one, and a bit of the identity."""
+        day = f", {np.datetime64(int(self.clock.utc(np.array([self.clock.t0_ns]))[0]), 'ns').astype('datetime64[m]')}"
+        self.stream.send_recording_name(f"{device}{day if self.clock.is_date else ''}, {identity[:6]}")
+
     def clear(self, path: str, t_ns: ArrayLike) -> None:
         """End what an entity shows at these times: a stream that stops must not be joined by a line."""
         import rerun as rr
@@ -107,21 +116,42 @@ class Recorder:
         return any(path == prefix or path.startswith(prefix + "/") for path in self.paths)
 
 
-def open_stream(path: Path, recording_id: str) -> Any:
-    """A stream into the file `path` that carries no wall-clock time: the same data give the same recording."""
+@contextmanager
+def recording_file(path: Path, recording_id: str) -> Iterator[Any]:
+    """A stream into the file `path` that carries no wall-clock time: the same data give the same recording.
+
+    Raises
+    ------
+    OSError
+        The file is not complete at the end.
+    """
     import rerun as rr
 
-    # Every static row its own chunk: the default batches by a wall-clock tick.
-    stream = rr.RecordingStream(
-        APPLICATION,
-        recording_id=recording_id,
-        send_properties=False,
-        batcher_config=rr.ChunkBatcherConfig.NEVER(),
-    )
+    # The default cuts static rows into chunks by a wall-clock tick.
+    never = rr.ChunkBatcherConfig.NEVER()
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=never)
     stream.save(path)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
-    return stream
+    try:
+        yield stream
+        _finish(stream, path)
+    finally:
+        stream.disconnect()
+
+
+def _finish(stream: Any, path: Path) -> None:
+    """End the file and make sure that all of it is there: a thread writes it, which does not tell of a full disk."""
+    from rerun.chunk import RrdReader
+
+    try:
+        stream.flush()
+        stream.disconnect()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a missing footer is only warned of
+            RrdReader(path).recordings()
+    except (RuntimeError, Warning) as error:
+        raise OSError(f"the recording is not complete: {error}") from error
 
 
 def fingerprint(*parts: Any) -> str:

@@ -65,7 +65,7 @@ def extent_of(session: Session, solution: Solution | None, causal: Solution | No
         if len(points):
             low, high = points.min(axis=0), points.max(axis=0)
             centre = (low + high) / 2
-            shift = np.round(centre, -3) if np.abs(centre).max() > 20_000.0 else np.zeros(3)
+            shift = np.where(np.abs(centre) > 20_000.0, np.round(centre, -3), 0.0)
             return Extent(low, high, shift, thinned(points, 2000))
     return None
 

@@ -54,10 +54,10 @@ def view(paths: Iterable[str | Path], web: bool = False) -> None:
     SmartnavError
         There is no display for a window, or the viewer ended with an error.
     """
+    if not web:
+        _require_display()
     with tempfile.TemporaryDirectory(prefix="smartnav-view-") as scratch:
         files = recordings(paths, Path(scratch))
-        if not web:
-            _require_display()
         command = [str(executable()), *(["--web-viewer"] if web else []), *(str(file.resolve()) for file in files)]
         code = subprocess.run(command, check=False).returncode
     if code not in (0, -2, 130):  # closed, or interrupted by the user
