@@ -44,14 +44,15 @@ class GnssNoise:
 
 # One default a device class, the same for every recording.
 DEVICE_CLASSES: dict[str, ImuNoise] = {
-    # Consumer MEMS in phones and loggers, used in motion.
+    # Consumer MEMS in phones and loggers, used in motion: about five times the white noise of a device at rest, to
+    # cover vibration, scale factor and misalignment.
     "mems": ImuNoise(
-        accel_noise_density=0.02,
-        gyro_noise_density=5e-4,
-        accel_bias_walk=1e-3,
-        gyro_bias_walk=2e-5,
+        accel_noise_density=0.03,
+        gyro_noise_density=3e-4,
+        accel_bias_walk=3e-4,
+        gyro_bias_walk=1e-5,
         accel_bias_sigma=0.3,
-        gyro_bias_sigma=0.02,
+        gyro_bias_sigma=0.05,
     ),
 }
 

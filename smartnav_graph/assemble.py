@@ -1,0 +1,172 @@
+"""Estimate -> Solution: nav axes, residuals by sensor, output rate, withheld rows scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.factors.gnss import PositionBuilder
+from smartnav_graph.graph import Memory, State
+from smartnav_graph.prediction import Kinematics, states_at
+from smartnav_graph.problem import Problem
+from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.solution import Residuals, Solution
+from smartnav_graph.timebase import interpolate, ns_from_seconds
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes."""
+
+    t_ns: NDArray[np.int64]
+    error: Floats
+
+    def to_dict(self) -> dict[str, float | int]:
+        """Count, horizontal and 3-D RMS, largest 3-D error, metres."""
+        square = self.error**2
+        return {
+            "count": len(self.error),
+            "rms_horizontal_m": float(np.sqrt(square[:, :2].sum(axis=1).mean())),
+            "rms_3d_m": float(np.sqrt(square.sum(axis=1).mean())),
+            "max_m": float(np.sqrt(square.sum(axis=1).max())),
+        }
+
+
+def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, covariance: Floats) -> Solution:
+    session = problem.session
+    return Solution(
+        t_ns=t_ns,
+        nav_R_body=states.R,
+        nav_t_body=states.p,
+        nav_v_body=states.v,
+        accel_bias=states.bias[:, :3],
+        gyro_bias=states.bias[:, 3:],
+        covariance=covariance,
+        t0_ns=session.t0_ns,
+        origin=session.origin,
+        forward=session.device.forward,
+        up=session.device.up,
+    )
+
+
+def to_solution(problem: Problem, estimate: Estimate, memory: Memory) -> Solution:
+    """The keyframes with their residuals."""
+    solution = _solution(problem, estimate.t_ns, Kinematics(*estimate.states()), estimate.covariance)
+    return replace(solution, residuals=residuals(problem, estimate, memory))
+
+
+def causal_solution(problem: Problem, states: Sequence[tuple[State | None, Floats]]) -> Solution:
+    """The estimate of each keyframe when it became known."""
+    known = [(state, covariance) for state, covariance in states if state is not None]
+    poses = np.array([state.nav.pose().matrix() for state, _ in known])
+    kinematics = Kinematics(
+        poses[:, :3, :3],
+        poses[:, :3, 3],
+        np.array([state.nav.velocity() for state, _ in known]),
+        np.array([state.bias.vector() for state, _ in known]),
+    )
+    t_ns = np.array([state.t_ns for state, _ in known], dtype=np.int64)
+    return _solution(problem, t_ns, kinematics, np.array([covariance for _, covariance in known]))
+
+
+def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals:
+    """Whitened residuals of every factor, and of rejected rows."""
+    parts: list[tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]] = []
+    positions = {builder.name: builder for builder in position_builders(problem.builders)}
+    for builder in positions.values():
+        found = fix_residuals(builder, problem.windows, estimate, memory)
+        used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
+        white = found.residual / found.sigma
+        weight = np.where(used, _weights(builder, memory, white), 0.0)
+        parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))
+    native: dict[str, tuple[list[int], list[Floats]]] = {}
+    for tag, factor in estimate.factors:
+        if tag.sensor not in positions and tag.sensor != "prior":
+            stamps, rows = native.setdefault(tag.sensor, ([], []))
+            stamps.append(tag.t_ns)
+            rows.append(factor.whitenedError(estimate.values))
+    for sensor, (stamps, rows) in native.items():
+        count = len(rows)
+        parts.append(
+            (np.array(stamps, dtype=np.int64), sensor, np.array(rows), np.ones(count), np.ones(count, dtype=bool))
+        )
+    return _flat(parts)
+
+
+def _weights(builder: PositionBuilder, memory: Memory, white: Floats) -> Floats:
+    """Robust weights (n,) of the loss in force."""
+    limit = {"huber": 1.345, "huber3": 3.0}.get(builder.loss(memory.phase))
+    norm = np.linalg.norm(white, axis=1)
+    return np.ones(len(white)) if limit is None else np.minimum(1.0, limit / np.maximum(norm, 1e-12))
+
+
+def _flat(parts: Sequence[tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]]) -> Residuals:
+    """One row a scalar."""
+    if not parts:
+        return Residuals.empty()
+    width = [rows.shape[1] if rows.ndim == 2 else 0 for _, _, rows, _, _ in parts]
+
+    def spread(pick: Any) -> NDArray[Any]:
+        return np.concatenate([np.repeat(pick(part), w) for part, w in zip(parts, width, strict=True)])
+
+    return Residuals(
+        t_ns=spread(lambda part: part[0]),
+        sensor=np.concatenate([np.full(part[2].size, part[1], dtype=object) for part in parts]),
+        axis=np.concatenate([np.tile(np.arange(w), len(part[0])) for part, w in zip(parts, width, strict=True)]),
+        whitened=np.concatenate([part[2].ravel() for part in parts]),
+        weight=spread(lambda part: part[3]),
+        used=spread(lambda part: part[4]),
+    )
+
+
+def _kinematics(solution: Solution) -> Kinematics:
+    bias = np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
+    return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
+
+
+def score(problem: Problem, keyframes: Solution) -> dict[str, Withheld]:
+    """Withheld rows against the smoothed prediction at their own time, through their sensor's lever arm."""
+    scored = {}
+    for name, stream in problem.withheld.items():
+        inside = (stream.t_ns >= keyframes.t_ns[0]) & (stream.t_ns <= keyframes.t_ns[-1])
+        rows = stream.take(inside)
+        if not len(rows):
+            continue
+        there = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, rows.t_ns)
+        lever = np.asarray(problem.session.mount(name).body_t)
+        scored[name] = Withheld(rows.t_ns, there.p + there.R @ lever - problem.session.nav_position(rows))
+    return scored
+
+
+def densify(problem: Problem, keyframes: Solution) -> Solution:
+    """The solution at the rate asked for. States by inertial prediction, covariances interpolated between keyframes."""
+    rate = problem.config.run.rate
+    if rate == "keyframes":
+        return keyframes
+    first, last = int(keyframes.t_ns[0]), int(keyframes.t_ns[-1])
+    if rate == "imu":
+        imu = problem.session.require_imu()
+        t_ns = imu.t_ns[(imu.t_ns >= first) & (imu.t_ns <= last)]
+    else:
+        t_ns = first + ns_from_seconds(np.arange(0.0, (last - first) / 1e9, 1.0 / float(rate)))
+    if len(t_ns) > 2_000_000:
+        raise SessionError("--rate", f"{len(t_ns)} output rows", "at most 2 000 000", "ask for a lower rate")
+    states = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, t_ns)
+    flat = interpolate(t_ns, keyframes.t_ns, keyframes.covariance.reshape(-1, 225))
+    return replace(_solution(problem, t_ns, states, flat.reshape(-1, 15, 15)), residuals=keyframes.residuals)
+
+
+def used_counts(problem: Problem, memory: Memory) -> Mapping[str, int]:
+    """Rows of every absolute sensor that the solution rests on."""
+    counts = {
+        b.name: sum(len(w.rows.get(b.name, ())) for w in problem.windows) for b in position_builders(problem.builders)
+    }
+    return {name: count - len(memory.rejected.get(name, ())) for name, count in counts.items()}

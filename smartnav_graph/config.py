@@ -1,0 +1,142 @@
+"""The rooms' options in one frozen tree, <-> TOML. Noise of a device does not live here but in calibration.toml."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cattrs
+import tomli_w
+
+from smartnav_graph.errors import ConfigError, SmartnavError
+from smartnav_graph.factors.control import ControlConfig
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.imu import ImuConfig
+from smartnav_graph.factors.prior import PriorConfig
+from smartnav_graph.initialise import InitialiseConfig
+from smartnav_graph.keyframes import KeyframeConfig
+from smartnav_graph.session import VEHICLES
+from smartnav_graph.smoothers.batch import BatchConfig
+from smartnav_graph.smoothers.incremental import ReplayConfig
+
+
+@dataclass(frozen=True)
+class GapConfig:
+    """What counts as a hole in the inertial data; see `timebase.find_gaps`."""
+
+    missing_s: float = 0.05
+    missing_periods: float = 3.0
+    bridged_rows: int = 5
+    slope_tolerance: float = 1e-3
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What one run is asked to do.
+
+    vehicle : none, car, trolley or foot; empty takes the session's own
+    sensors : names to use, or names with a leading minus to leave out; empty uses all
+    withhold : specifications of rows kept back and scored; start_s, end_s : stretch, seconds since time zero
+    initial : "e,n,u,heading_deg[,sigma_m,sigma_deg]"; rate : ``keyframes``, ``imu`` or a frequency in Hz
+    passes : most solves of a batch run
+    """
+
+    vehicle: str = ""
+    sensors: tuple[str, ...] = ()
+    withhold: tuple[str, ...] = ()
+    start_s: float | None = None
+    end_s: float | None = None
+    initial: str = ""
+    rate: str = "keyframes"
+    passes: int = 8
+
+    def __post_init__(self) -> None:
+        if self.vehicle and self.vehicle not in VEHICLES:
+            raise ConfigError("--vehicle", f"{self.vehicle!r}", f"one of {', '.join(VEHICLES)}")
+        if self.start_s is not None and self.end_s is not None and self.start_s >= self.end_s:
+            raise ConfigError("--from, --to", f"{self.start_s} s to {self.end_s} s", "--from before --to")
+        if self.rate not in ("keyframes", "imu"):
+            try:
+                valid = 0.0 < float(self.rate) <= 1000.0
+            except ValueError:
+                valid = False
+            if not valid:
+                raise ConfigError("--rate", f"{self.rate!r}", "keyframes, imu or a frequency in (0, 1000] Hz")
+        if self.passes < 1:
+            raise ConfigError("config [run]", f"passes = {self.passes}", ">= 1")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All options. Sections are the rooms, fields their options."""
+
+    run: RunConfig = field(default_factory=RunConfig)
+    gaps: GapConfig = field(default_factory=GapConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    initialise: InitialiseConfig = field(default_factory=InitialiseConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
+    gnss: GnssConfig = field(default_factory=GnssConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    batch: BatchConfig = field(default_factory=BatchConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+_converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+def from_dict(data: dict[str, Any], where: str | Path = "config.toml") -> Config:
+    """Config of a parsed TOML table.
+
+    Raises
+    ------
+    ConfigError
+        Unknown section or key (named with its path), wrong type or value.
+    """
+    try:
+        return _converter.structure(data, Config)
+    except cattrs.BaseValidationError as error:
+        named = _named_cause(error)
+        if named is not None:
+            raise named from error
+        text = "; ".join(cattrs.transform_error(error)).replace("$.", "").replace("@ $", "at the top level")
+        raise ConfigError(where, text, "the sections and keys of the configuration") from error
+
+
+def _named_cause(error: BaseException) -> SmartnavError | None:
+    for inner in getattr(error, "exceptions", ()):
+        found = inner if isinstance(inner, SmartnavError) else _named_cause(inner)
+        if found is not None:
+            return found
+    return None
+
+
+def load(path: str | Path) -> Config:
+    """Read config.toml.
+
+    Raises
+    ------
+    ConfigError
+        Missing or unreadable file, or what `from_dict` finds.
+    """
+    path = Path(path)
+    try:
+        return from_dict(tomllib.loads(path.read_text(encoding="utf-8")), path)
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read ({error.strerror})", "a config.toml") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(path, f"is no TOML ({error})", "a config.toml") from error
+
+
+def dumps(config: Config) -> str:
+    """The text of config.toml; options that are not set are left out."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items() if v is not None}
+        return list(value) if isinstance(value, tuple) else value
+
+    return tomli_w.dumps(plain(dataclasses.asdict(config)))

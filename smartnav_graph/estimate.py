@@ -1,0 +1,257 @@
+"""The loop, for batch and for replay: windows -> steps -> smoother -> solution.
+
+for _ in range(passes):                       # replay: one, causal
+    for window in windows:
+        smoother.update(build_step(window, smoother.latest(), builders, memory))
+    memory, done = revise(smoother.estimate(), memory)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.assemble import Withheld, causal_solution, densify, score, to_solution
+from smartnav_graph.config import Config
+from smartnav_graph.errors import SolverError
+from smartnav_graph.factors import ABSOLUTE
+from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.graph import Builder, Memory, Window, build_step
+from smartnav_graph.initialise import Given, Initial, Initialiser
+from smartnav_graph.problem import Problem, prepare
+from smartnav_graph.revise import revise
+from smartnav_graph.session import Session
+from smartnav_graph.smoothers import Smoother
+from smartnav_graph.smoothers.batch import Batch
+from smartnav_graph.smoothers.estimate import Estimate, largest_difference
+from smartnav_graph.smoothers.incremental import Incremental
+from smartnav_graph.solution import Solution
+from smartnav_graph.summary import summarise
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything one run gives. `summary` is what summary.json holds."""
+
+    problem: Problem
+    solution: Solution
+    summary: Mapping[str, Any]
+    causal: Solution | None = None
+    withheld: Mapping[str, Withheld] = field(default_factory=dict)
+
+    @property
+    def session(self) -> Session:
+        return self.problem.session
+
+
+class Clock:
+    """Wall seconds by stage."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+        self._start = self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Add the time since the last lap to `stage`."""
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
+        self._last = now
+
+    def to_dict(self) -> dict[str, float]:
+        """Seconds by stage and in all."""
+        return {**self.stages, "total": time.perf_counter() - self._start}
+
+
+def one_pass(
+    smoother: Smoother, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory, problem: Problem
+) -> None:
+    """Every window through the smoother."""
+    for window in windows:
+        smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
+
+
+def solve_passes(
+    problem: Problem,
+    windows: Sequence[Window],
+    prior: PriorBuilder,
+    memory: Memory,
+    *,
+    warm: Any = None,
+    passes: int | None = None,
+    progress: Progress = _silent,
+) -> tuple[Estimate, Memory, int]:
+    """Batch passes until there is nothing more to learn.
+
+    Returns
+    -------
+    estimate, the memory it was made with, and the number of passes
+    """
+    most = passes or problem.config.run.passes
+    builders = [prior, *problem.builders]
+    for count in range(1, most + 1):
+        progress("solve", count - 1, most)
+        smoother = Batch(problem.config.batch, warm, problem.session.t0_ns)
+        one_pass(smoother, windows, builders, memory, problem)
+        estimate = smoother.estimate()
+        learnt, done = revise(problem.builders, windows, estimate, memory)
+        if done or count == most:
+            return estimate, memory, count
+        memory, warm = learnt, estimate.values
+    raise AssertionError("unreachable")
+
+
+def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
+    """First state of a problem; `longest_s` bounds the stretch it may look at."""
+    session, config = problem.session, problem.config.initialise
+    if longest_s is not None:
+        config = replace(config, max_stretch_s=min(config.max_stretch_s, longest_s))
+        config = replace(config, stretch_s=min(config.stretch_s, config.max_stretch_s))
+
+    def solve(prior: PriorBuilder, count: int) -> tuple[Estimate, Memory]:
+        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, Memory())
+        return estimate, memory
+
+    given = Given.parse(problem.config.run.initial) if problem.config.run.initial else None
+    initialiser = Initialiser(
+        windows=problem.windows,
+        imu=session.require_imu(),
+        fixes=_absolute_positions(problem),
+        gravity=session.gravity,
+        noise=problem.calibration.imu_noise,
+        forward=session.device.forward,
+        magnetometer=session.magnetometer,
+        declination_deg=0.0,
+        config=config,
+    )
+    return initialiser.run(solve, given)
+
+
+def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats]:
+    """Stamps and nav positions of all absolute measurements, in time order."""
+    streams = [stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None]
+    if not streams:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    t = np.concatenate([stream.t_ns for stream in streams])
+    p = np.concatenate([problem.session.nav_position(stream) for stream in streams])
+    order = np.argsort(t, kind="stable")
+    return t[order], p[order]
+
+
+def smooth(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:
+    """Batch smoothing of a recorded session.
+
+    Raises
+    ------
+    SessionError, ConfigError, SolverError
+        Bad input, or a problem that cannot be solved; the message says what to do.
+    """
+    clock = Clock()
+    problem = prepare(session, config or Config())
+    clock.lap("prepare")
+    initial = initialise(problem)
+    clock.lap("initialise")
+    estimate, memory, passes = solve_passes(problem, problem.windows, initial.prior, initial.memory, progress=progress)
+    clock.lap("solve")
+    _refuse_empty(problem, memory)
+    return _finish(problem, initial, estimate, memory, clock, {"passes": passes})
+
+
+def _finish(
+    problem: Problem,
+    initial: Initial,
+    estimate: Estimate,
+    memory: Memory,
+    clock: Clock,
+    extra: Mapping[str, Any],
+    causal: Solution | None = None,
+) -> Run:
+    keyframes = to_solution(problem, estimate, memory)
+    withheld = score(problem, keyframes)
+    solution = densify(problem, keyframes)
+    clock.lap("assemble")
+    summary = summarise(problem, initial, estimate, memory, keyframes, withheld, clock.to_dict(), extra)
+    return Run(problem, solution, summary, causal, withheld)
+
+
+def _refuse_empty(problem: Problem, memory: Memory) -> None:
+    """All fixes rejected is no solution."""
+    there = [b.name for b in problem.builders if b.name in ABSOLUTE]
+    counts = {name: sum(len(w.rows.get(name, ())) for w in problem.windows) for name in there}
+    if counts and all(len(memory.rejected.get(name, ())) >= count for name, count in counts.items()):
+        rows = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise SolverError(
+            "solve",
+            f"every absolute measurement was rejected ({rows})",
+            "measurements of the same motion as the inertial data",
+            "check clock and units with `smartnav info`, or use --gnss.loss huber",
+        )
+
+
+def replay(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:
+    """One window at a time, causal but for the initialisation stretch (at most 30 s); an interrupt leaves what is done.
+
+    Raises
+    ------
+    SessionError, ConfigError, SolverError
+        As `smooth`.
+    """
+    clock = Clock()
+    problem = prepare(session, config or Config())
+    clock.lap("prepare")
+    initial = initialise(problem, longest_s=30.0)
+    clock.lap("initialise")
+    options = problem.config.replay
+    smoother = Incremental(options, problem.session.t0_ns)
+    builders = [initial.prior, *problem.builders]
+    memory = replace(initial.memory, phase="causal", rejected={})
+    latency, states, interrupted = [], [], False
+    total = len(problem.windows)
+    try:
+        for window in problem.windows:
+            progress("replay", window.index, total)
+            begin = time.perf_counter()
+            smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
+            states.append((smoother.latest(), smoother.covariance()))
+            latency.append(1e3 * (time.perf_counter() - begin))
+    except KeyboardInterrupt:
+        interrupted = True
+        if len(states) < 2:
+            raise
+    clock.lap("replay")
+    done = len(states)
+    problem = replace(problem, windows=problem.windows[:done])
+    before = smoother.estimate(done)
+    extra: dict[str, Any] = {
+        "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
+        "update_ms": {name: float(f(latency)) for name, f in _LATENCY.items()},
+        "delay_s": initial.stretch_s,
+    }
+    estimate, passes = before, 0
+    if options.polish:
+        estimate, memory, passes = solve_passes(
+            problem, problem.windows, initial.prior, initial.memory, warm=before.values, progress=progress
+        )
+        metres, degrees = largest_difference(before, estimate)
+        extra |= {"polish": {"largest_change_m": metres, "largest_change_deg": degrees, "passes": passes}}
+        clock.lap("polish")
+    causal = causal_solution(problem, states)
+    return _finish(problem, initial, estimate, memory, clock, extra, causal)
+
+
+_LATENCY: Mapping[str, Callable[[Sequence[float]], Any]] = {
+    "median": np.median,
+    "p99": lambda values: np.percentile(values, 99),
+    "max": np.max,
+}

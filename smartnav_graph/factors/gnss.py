@@ -1,0 +1,112 @@
+"""Position fixes: r = nav_t_body + nav_R_body * body_t_antenna - fix, in nav metres (GTSAM's GPSFactorArm)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.model import GnssNoise
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
+from smartnav_graph.session import Session
+from smartnav_graph.streams import Positioned
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GnssConfig:
+    """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``huber`` or
+    ``none``; gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes
+    that carry none from the kept data."""
+
+    loss: str = "gate"
+    gate_probability: float = 0.999
+    estimate_sigma: bool = True
+
+    def __post_init__(self) -> None:
+        if self.loss not in ("gate", "huber", "none"):
+            raise ConfigError("config [gnss]", f"loss = {self.loss!r}", "gate, huber or none")
+        if not 0.5 < self.gate_probability < 1:
+            raise ConfigError("config [gnss]", f"gate_probability = {self.gate_probability}", "between 0.5 and 1")
+
+
+def fix_sigmas(stream: Positioned, default: GnssNoise) -> Floats:
+    """Sigmas (n, 3) m: the stream's own where given, the class default elsewhere."""
+    h, v = default.horizontal_sigma, default.vertical_sigma
+    sigma = np.tile(np.array([h, h, v]), (len(stream), 1))
+    if stream.sigma is not None:
+        known = np.isfinite(stream.sigma)
+        sigma[known] = stream.sigma[known]
+    return sigma
+
+
+def noise_model(sigmas: Floats, loss: str) -> gtsam.noiseModel.Base:
+    """Diagonal noise under a loss applied to the whole fix: ``none``, ``huber``, ``cauchy`` or ``huber3``."""
+    model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    estimators = gtsam.noiseModel.mEstimator
+    if loss == "none":
+        return model
+    estimator = {
+        "huber": lambda: estimators.Huber.Create(1.345),
+        "huber3": lambda: estimators.Huber.Create(3.0),
+        "cauchy": lambda: estimators.Cauchy.Create(1.0),
+    }[loss]()
+    return gtsam.noiseModel.Robust.Create(estimator, model)
+
+
+@dataclass
+class PositionBuilder:
+    """Adds one position factor a fix.
+
+    position (n, 3) nav m, sigma (n, 3) m, lever (3,) m body axes; `own_sigma` (n,) marks rows whose sigma came with
+    the data and is never scaled.
+    """
+
+    name: str
+    position: Floats
+    sigma: Floats
+    own_sigma: NDArray[np.bool_]
+    lever: Floats
+    config: GnssConfig = field(default_factory=GnssConfig)
+
+    @classmethod
+    def of(
+        cls, session: Session, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig
+    ) -> PositionBuilder:
+        """Builder of a session's stream of positions."""
+        own = np.zeros(len(stream), bool) if stream.sigma is None else np.isfinite(stream.sigma).all(axis=1)
+        lever = np.asarray(session.mount(name).body_t, dtype=np.float64)
+        return cls(name, session.nav_position(stream), fix_sigmas(stream, noise), own, lever, config)
+
+    def scaled_sigma(self, memory: Memory) -> Floats:
+        """Sigmas (n, 3) m after the noise scale of this sensor."""
+        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * memory.scale(self.name))
+
+    def loss(self, phase: str) -> str:
+        """Loss of a phase; see `Memory`."""
+        if self.config.loss == "gate":
+            return {"robust": "cauchy", "causal": "huber3"}.get(phase, "none")
+        return self.config.loss
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """A factor for every row of this stream at the keyframe."""
+        rows = window.rows.get(self.name, ())
+        if len(rows) == 0:
+            return
+        loss = self.loss(memory.phase)
+        scale = memory.scale(self.name)
+        pose = key("X", window.index)
+        for row in rows:
+            if memory.is_rejected(self.name, int(row)):
+                continue
+            sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else scale)
+            model = noise_model(sigma, loss)
+            tag = Tag(self.name, window.t1_ns, int(row))
+            if self.lever.any():
+                step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever, model))
+            else:
+                step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))

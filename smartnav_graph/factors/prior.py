@@ -1,0 +1,69 @@
+"""What is assumed of the first keyframe. Weak by default: data, not the prior, decide.
+
+Rotation sigma pi / sqrt(3) is that of an angle nobody knows; velocity 100 m/s bounds what moves on the ground;
+position has no prior unless one was given; biases have the turn-on spread of the device class.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
+
+Floats = NDArray[np.float64]
+
+UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Sigmas of the first state: angle rad, speed m/s."""
+
+    angle_sigma: float = UNKNOWN_ANGLE
+    speed_sigma: float = 100.0
+
+
+@dataclass
+class PriorBuilder:
+    """Prior factors at the first keyframe.
+
+    start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,
+    sigma_bias (6,) m/s^2 and rad/s around `bias_mean`.
+    """
+
+    start: State
+    sigma_rot: Floats
+    sigma_pos: Floats | None
+    sigma_vel: Floats
+    sigma_bias: Floats
+    velocity_mean: Floats
+    bias_mean: gtsam.imuBias.ConstantBias
+    name: str = "prior"
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """Prior factors and initial values of the first keyframe; nothing later."""
+        if window.kind != "first":
+            return
+        step.predicted, step.bias = self.start.nav, self.start.bias
+        tag = Tag("prior", window.t1_ns)
+        x, v, b = (key(letter, window.index) for letter in "XVB")
+        pose = self.start.nav.pose()
+        nav_R_body = pose.rotation().matrix()
+        rot = nav_R_body.T @ np.diag(self.sigma_rot**2) @ nav_R_body
+        if self.sigma_pos is None:
+            model = gtsam.noiseModel.Gaussian.Covariance(rot)
+            step.add(tag, gtsam.PoseRotationPrior3D(x, pose, model))
+        else:
+            cov = np.zeros((6, 6))
+            cov[:3, :3] = rot
+            cov[3:, 3:] = nav_R_body.T @ np.diag(self.sigma_pos**2) @ nav_R_body
+            step.add(tag, gtsam.PriorFactorPose3(x, pose, gtsam.noiseModel.Gaussian.Covariance(cov)))
+        step.add(tag, gtsam.PriorFactorVector(v, self.velocity_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_vel)))
+        step.add(
+            tag,
+            gtsam.PriorFactorConstantBias(b, self.bias_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_bias)),
+        )

@@ -1,0 +1,409 @@
+"""First windows -> first state, without being told anything.
+
+Given: the user's position and heading. Static: a rest at the start gives the vertical and the gyro bias, the first
+fixes or a magnetometer the heading. Dynamic: the integrated specific force, seen from the first body frame, must lie
+on the curve of the fixes once position, velocity and gravity are taken out; the rotation between the two curves is
+the first attitude (Wahba's problem, Kabsch 1976), refined by the factor graph of the first windows. Where the data
+leave the heading open, the refinement is started from headings all round and the cheapest solution is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph import frames
+from smartnav_graph.calibration.model import ImuNoise
+from smartnav_graph.errors import ConfigError, SolverError
+from smartnav_graph.factors.prior import UNKNOWN_ANGLE, PriorBuilder
+from smartnav_graph.graph import Memory, State, Window
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.streams import Imu, Magnetometer
+from smartnav_graph.timebase import NS, seconds_since
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InitialiseConfig:
+    """stretch_s : first windows used; max_stretch_s : how far the stretch grows while the heading stays open;
+    good_heading_deg : sigma that counts as known; starts : headings tried when it does not;
+    rest_s : shortest rest that counts."""
+
+    stretch_s: float = 30.0
+    max_stretch_s: float = 120.0
+    good_heading_deg: float = 10.0
+    starts: int = 8
+    rest_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.stretch_s <= self.max_stretch_s and self.starts >= 1 and self.rest_s > 0):
+            raise ConfigError(
+                "config [initialise]",
+                f"stretch_s = {self.stretch_s}, max_stretch_s = {self.max_stretch_s}, starts = {self.starts}",
+                "0 < stretch_s <= max_stretch_s and at least one start",
+            )
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user knows of the start: nav position m, heading deg clockwise from north, sigmas m and deg."""
+
+    position: tuple[float, float, float]
+    heading_deg: float
+    sigma_m: float = 10.0
+    sigma_deg: float = 10.0
+
+    @classmethod
+    def parse(cls, text: str) -> Given:
+        """Of ``e,n,u,heading_deg[,sigma_m,sigma_deg]``.
+
+        Raises
+        ------
+        ConfigError
+            Not four or six numbers, or a sigma that is not > 0.
+        """
+        try:
+            numbers = [float(part) for part in text.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (4, 6) or not np.isfinite(numbers).all() or min(numbers[4:], default=1.0) <= 0:
+            raise ConfigError(
+                "--initial", f"{text!r}", "e,n,u,heading_deg[,sigma_m,sigma_deg] in metres and degrees, sigmas > 0"
+            )
+        return cls((numbers[0], numbers[1], numbers[2]), numbers[3], *numbers[4:])
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A rest at the start: mean specific force (3,) and rate (3,), their scatter, and how long it lasted."""
+
+    accel: Floats
+    gyro: Floats
+    gyro_sigma: float
+    length_s: float
+
+
+def find_rest(imu: Imu, start_ns: int, gravity: float, shortest_s: float, longest_s: float = 30.0) -> Rest | None:
+    """The rest that begins at `start_ns`, or None.
+
+    Half-second pieces are at rest while rate and specific force scatter little, and their means stay with those of
+    the first piece. Steady travel looks alike: fixes must be asked too.
+    """
+    first = int(np.searchsorted(imu.t_ns, start_ns))
+    t = seconds_since(imu.t_ns[first:], start_ns)
+    t = t[t <= longest_s]
+    if len(t) < 4 or t[-1] < shortest_s:
+        return None
+    accel, gyro = imu.accel[first : first + len(t)], imu.gyro[first : first + len(t)]
+    edges = np.searchsorted(t, np.arange(0.0, t[-1], 0.5))
+    last = 0
+    for i, j in zip(edges[:-1], edges[1:], strict=True):
+        if j - i < 3:
+            break
+        quiet = gyro[i:j].std(axis=0).max() < 0.01 and accel[i:j].std(axis=0).max() < 0.12
+        steady = np.abs(accel[i:j].mean(axis=0) - accel[: edges[1]].mean(axis=0)).max() < 0.08
+        level = abs(np.linalg.norm(accel[i:j].mean(axis=0)) - gravity) < 0.6
+        still = np.abs(gyro[i:j].mean(axis=0) - gyro[: edges[1]].mean(axis=0)).max() < 0.005
+        if not (quiet and steady and level and still):
+            break
+        last = int(j)
+    if last == 0 or t[last - 1] < shortest_s:
+        return None
+    scatter = float(gyro[:last].std(axis=0).max())
+    sigma = max(scatter / np.sqrt(last), 3e-4)
+    return Rest(accel[:last].mean(axis=0), gyro[:last].mean(axis=0), sigma, float(t[last - 1]))
+
+
+def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> tuple[Floats, Floats, Floats]:
+    """Attitude, position and velocity at t = 0 from an inertial curve and fixes.
+
+    fix_k = p0 + v0 t_k - g t_k^2 / 2 + R curve_k; position and velocity are projected out, R solves what is left.
+
+    Parameters
+    ----------
+    curve : (n, 3) doubly integrated specific force in the first body frame; fixes : (n, 3) nav m; t : (n,) s, n >= 4
+    """
+    fall = np.zeros_like(fixes)
+    fall[:, 2] = -0.5 * gravity * t**2
+    basis, _ = np.linalg.qr(np.stack([np.ones_like(t), t], axis=-1))
+    target, source = fixes - fall, curve
+
+    def project(rows: Floats) -> Floats:
+        return rows - basis @ (basis.T @ rows)
+
+    u, _, vt = np.linalg.svd(project(target).T @ project(source))
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    line = np.linalg.lstsq(np.stack([np.ones_like(t), t], axis=-1), target - source @ R.T, rcond=None)[0]
+    return R, line[0], line[1]
+
+
+def inertial_curve(windows: Sequence[Window], bias: gtsam.imuBias.ConstantBias) -> Floats:
+    """Doubly integrated specific force (n, 3) at the end of each window, in the first body frame."""
+    pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), bias)
+    curve = []
+    for window in windows:
+        for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
+            pim.integrateMeasurement(accel, gyro, dt)
+        curve.append(pim.deltaPij())
+    return np.array(curve).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Initial:
+    """The first state as a prior, what it rests on, and the noise scales found on the way."""
+
+    prior: PriorBuilder
+    method: str
+    sentence: str
+    heading_deg: float
+    sigma_heading_deg: float
+    stretch_s: float
+    starts: int
+    memory: Memory
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "method": self.method,
+            "sentence": self.sentence,
+            "heading_deg": round(self.heading_deg, 3),
+            "sigma_heading_deg": round(self.sigma_heading_deg, 3),
+            "stretch_s": round(self.stretch_s, 3),
+            "starts": self.starts,
+        }
+
+
+# Solves the first `count` windows from a prior: the loop of estimate.py, handed down.
+Solve = Callable[[PriorBuilder, int], tuple[Estimate, Memory]]
+
+
+@dataclass(frozen=True)
+class Initialiser:
+    """Everything `run` needs.
+
+    fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order
+    """
+
+    windows: Sequence[Window]
+    imu: Imu
+    fixes: tuple[NDArray[np.int64], Floats]
+    gravity: float
+    noise: ImuNoise
+    forward: str
+    magnetometer: Magnetometer | None
+    declination_deg: float
+    config: InitialiseConfig
+
+    def run(self, solve: Solve, given: Given | None) -> Initial:
+        """The first state.
+
+        Raises
+        ------
+        SolverError
+            No absolute sensor, no given start and no rest: nothing to begin from.
+        """
+        start_ns = self.windows[0].t1_ns
+        rest = find_rest(self.imu, start_ns, self.gravity, self.config.rest_s)
+        if rest is not None and self._moving(start_ns, rest.length_s):
+            rest = None
+        if given is not None:
+            return self._from_given(given, rest)
+        if len(self.fixes[0]) == 0:
+            if rest is None:
+                raise SolverError(
+                    "initialisation",
+                    "no absolute sensor (no position fix, no control point) and no rest at the start",
+                    "position fixes, control points, or a device at rest for a second",
+                    'add a gnss, control or pose_fixes stream, or give --initial "e,n,u,heading_deg"',
+                )
+            return self._dead_reckoning(rest)
+        return self._search(solve, rest)
+
+    def _moving(self, start_ns: int, length_s: float) -> bool:
+        """Whether the fixes contradict a rest."""
+        t, p = self.fixes
+        chosen = (t >= start_ns) & (t <= start_ns + int((length_s + 2.0) * NS))
+        return chosen.sum() >= 2 and bool(np.linalg.norm(p[chosen][-1] - p[chosen][0]) > 10.0)
+
+    def _level(self, rest: Rest | None) -> Floats:
+        """Body direction (3,) that points up: mean specific force of the rest, or of the first two seconds."""
+        if rest is not None:
+            return rest.accel
+        first = int(np.searchsorted(self.imu.t_ns, self.windows[0].t1_ns))
+        last = int(np.searchsorted(self.imu.t_ns, self.windows[0].t1_ns + 2 * NS))
+        return np.asarray(self.imu.accel[first : max(last, first + 1)].mean(axis=0))
+
+    def _magnetic_heading(self, up: Floats, length_s: float) -> float | None:
+        """Heading deg of the forward axis from the mean field over the rest; None without a magnetometer."""
+        if self.magnetometer is None:
+            return None
+        start = self.windows[0].t1_ns
+        chosen = (self.magnetometer.t_ns >= start) & (self.magnetometer.t_ns <= start + int(length_s * NS))
+        if not chosen.any():
+            return None
+        field_ = self.magnetometer.field_ut[chosen].mean(axis=0)
+        level = frames.nav_R_body_from_heading(0.0, up, self.forward) @ field_
+        return float(np.degrees(-np.arctan2(level[0], level[1])) + self.declination_deg) % 360.0
+
+    def _prior(self, state: State, rest: Rest | None, **sigmas: Any) -> PriorBuilder:
+        noise = self.noise
+        bias = np.array([noise.accel_bias_sigma] * 3 + [noise.gyro_bias_sigma] * 3)
+        mean = gtsam.imuBias.ConstantBias()
+        velocity = np.full(3, 100.0)
+        if rest is not None:
+            bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
+            mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+            velocity = np.full(3, 0.05)
+        prior = PriorBuilder(
+            start=state,
+            sigma_rot=np.full(3, UNKNOWN_ANGLE),
+            sigma_pos=None,
+            sigma_vel=velocity,
+            sigma_bias=bias,
+            velocity_mean=np.zeros(3),
+            bias_mean=mean,
+        )
+        return replace(prior, **sigmas)
+
+    def _state(self, R: Floats, p: Floats, v: Floats, rest: Rest | None) -> State:
+        bias = gtsam.imuBias.ConstantBias() if rest is None else gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+        return State(0, self.windows[0].t1_ns, gtsam.NavState(gtsam.Pose3(gtsam.Rot3(R), p), v), bias)
+
+    def _levelled(
+        self, heading_deg: float, p: Floats, sigma_m: float, sigma_deg: float, rest: Rest | None
+    ) -> PriorBuilder:
+        """A held start: levelled by the accelerometer, position and heading as told."""
+        up = self._level(rest)
+        R = frames.nav_R_body_from_heading(heading_deg, up, self.forward)
+        tilt = max(self.noise.accel_bias_sigma / self.gravity, 0.002) if rest is not None else 0.1
+        return self._prior(
+            self._state(R, p, np.zeros(3), rest),
+            rest,
+            sigma_rot=np.array([tilt, tilt, np.radians(sigma_deg)]),
+            sigma_pos=np.full(3, sigma_m),
+            **({} if rest is not None else {"sigma_vel": np.full(3, 10.0)}),
+        )
+
+    def _from_given(self, given: Given, rest: Rest | None) -> Initial:
+        prior = self._levelled(given.heading_deg, np.array(given.position), given.sigma_m, given.sigma_deg, rest)
+        how = "levelled over a rest" if rest is not None else "levelled by the first two seconds"
+        sentence = (
+            f"Start given: heading {given.heading_deg:.1f} deg +- {given.sigma_deg:g} deg, position +- "
+            f"{given.sigma_m:g} m; {how}."
+        )
+        return Initial(prior, "given", sentence, given.heading_deg, given.sigma_deg, 0.0, 1, Memory())
+
+    def _dead_reckoning(self, rest: Rest) -> Initial:
+        magnetic = self._magnetic_heading(rest.accel, rest.length_s)
+        heading, sigma = (magnetic, 10.0) if magnetic is not None else (0.0, 1e-3)
+        prior = self._levelled(heading, np.zeros(3), 1e-3, sigma, rest)
+        told = (
+            f"heading {heading:.1f} deg from the magnetometer"
+            if magnetic is not None
+            else "heading and position set to zero (local frame)"
+        )
+        sentence = f"No absolute sensor: started from a rest of {rest.length_s:.1f} s; {told}."
+        return Initial(prior, "static", sentence, heading, sigma, rest.length_s, 1, Memory())
+
+    def _search(self, solve: Solve, rest: Rest | None) -> Initial:
+        """Solve the first stretch from one start, from starts all round if that leaves doubt, longer if it still does."""
+        stretch = self.config.stretch_s
+        while True:
+            count = self._count(stretch)
+            best, tried = self._best(solve, count, rest)
+            sigma = best.sigma_heading_deg
+            if (
+                sigma < self.config.good_heading_deg
+                or stretch >= self.config.max_stretch_s
+                or count >= len(self.windows)
+            ):
+                return replace(best, starts=tried)
+            stretch *= 2.0
+
+    def _count(self, stretch_s: float) -> int:
+        """Windows up to `stretch_s` after the first fix."""
+        begin = max(int(self.fixes[0][0]), self.windows[0].t1_ns)
+        ends = np.array([w.t1_ns for w in self.windows])
+        return int(np.searchsorted(ends, begin + int(stretch_s * NS), side="right"))
+
+    def _best(self, solve: Solve, count: int, rest: Rest | None) -> tuple[Initial, int]:
+        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
+        results: list[tuple[float, Initial]] = []
+        tried = 0
+        for state in self._starts(count, rest, magnetic):
+            tried += 1
+            try:
+                estimate, memory = solve(self._prior(state, rest), count)
+            except SolverError:
+                continue
+            results.append((estimate.cost, self._found(estimate, memory, rest, count, magnetic is not None)))
+            sure = results[-1][1].sigma_heading_deg < self.config.good_heading_deg
+            if tried == 1 and sure and estimate.converged and estimate.cost < 5.0 * count:
+                break
+        if not results:
+            raise SolverError(
+                "initialisation",
+                f"no start converges on the first {count} keyframes",
+                "inertial data and fixes of the same motion",
+                'check units, axes and clocks with `smartnav info`, or give --initial "e,n,u,heading_deg"',
+            )
+        return min(results, key=lambda item: item[0])[1], tried
+
+    def _starts(self, count: int, rest: Rest | None, magnetic: float | None) -> list[State]:
+        """First states to try: the inertial curve laid on the fixes, then headings all round."""
+        windows = self.windows[:count]
+        t_ns, fixes = self.fixes
+        used = t_ns <= windows[-1].t1_ns
+        t_ns, fixes = t_ns[used], fixes[used]
+        bias = gtsam.imuBias.ConstantBias() if rest is None else gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+        ends = np.array([w.t1_ns for w in windows])
+        t = (t_ns - ends[0]) / NS
+        starts = []
+        p0, v0 = fixes[0], np.zeros(3)
+        up = self._level(rest)
+        if len(t_ns) >= 2 and rest is None:
+            v0 = (fixes[1] - fixes[0]) / (t[1] - t[0])
+            p0 = fixes[0] - v0 * t[0]
+        if len(t_ns) >= 4:
+            curve = inertial_curve(windows, bias)[np.minimum(np.searchsorted(ends, t_ns), count - 1)]
+            R, p, v = kabsch_attitude(curve, fixes, t, self.gravity)
+            starts.append(self._state(R, p, v, rest))
+            if rest is None:
+                up = R[2]
+        if magnetic is not None:
+            starts.insert(0, self._state(frames.nav_R_body_from_heading(magnetic, up, self.forward), p0, v0, rest))
+        course = np.degrees(np.arctan2(v0[0], v0[1])) if np.linalg.norm(v0[:2]) > 1.0 else 0.0
+        for heading in course + np.arange(self.config.starts) * 360.0 / self.config.starts:
+            R = frames.nav_R_body_from_heading(float(heading), up, self.forward)
+            starts.append(self._state(R, p0, v0, rest))
+        return starts
+
+    def _found(self, estimate: Estimate, memory: Memory, rest: Rest | None, count: int, magnetic: bool) -> Initial:
+        """The refined start: its values, under the weak prior (the fixes are used again by the smoother)."""
+        R, p, v, bias = (rows[0] for rows in estimate.states())
+        state = State(
+            0,
+            self.windows[0].t1_ns,
+            gtsam.NavState(gtsam.Pose3(gtsam.Rot3(R), p), v),
+            gtsam.imuBias.ConstantBias(bias[:3], bias[3:]),
+        )
+        heading = float(frames.heading_pitch_roll_deg(R, self.forward)[0, 0])
+        sigma = float(np.degrees(np.sqrt(estimate.covariance[0, 2, 2])))
+        stretch = (self.windows[count - 1].t1_ns - self.windows[0].t1_ns) / NS
+        method = "static" if rest is not None else "dynamic"
+        source = "the magnetometer and the fixes" if magnetic else "the fixes and the inertial data"
+        vertical = (
+            f"vertical and gyro bias from a rest of {rest.length_s:.1f} s"
+            if rest is not None
+            else "no rest at the start"
+        )
+        sentence = (
+            f"Heading {heading:.1f} deg +- {min(sigma, 180.0):.1f} deg found from {source} of the first "
+            f"{stretch:.0f} s; {vertical}."
+        )
+        return Initial(self._prior(state, rest), method, sentence, heading, min(sigma, 180.0), stretch, 1, memory)

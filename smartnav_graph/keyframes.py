@@ -1,0 +1,134 @@
+"""Measurements + config -> the windows between keyframes.
+
+Keyframes stand at the union of aiding epochs, at borders of gaps and standstills, and nowhere further apart than a
+maximum spacing. Inertial data are cut at keyframes by linear interpolation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.graph import Window
+from smartnav_graph.streams import Imu
+from smartnav_graph.timebase import NS, Gap, interpolate, ns_from_seconds
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """max_spacing_s : longest window outside gaps; merge_s : aiding epochs closer than this share a keyframe;
+    lead_s : how far keyframes reach beyond the first and the last absolute measurement."""
+
+    max_spacing_s: float = 1.0
+    merge_s: float = 1e-4
+    lead_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not (self.max_spacing_s > 0 and 0 <= self.merge_s < self.max_spacing_s and self.lead_s >= 0):
+            raise ConfigError(
+                "config [keyframes]",
+                f"max_spacing_s = {self.max_spacing_s}, merge_s = {self.merge_s}",
+                "max_spacing_s > merge_s >= 0 seconds",
+            )
+
+
+def keyframe_times(
+    span_ns: tuple[int, int], aiding: Sequence[Times], gaps: Sequence[Gap], config: KeyframeConfig
+) -> Times:
+    """Strictly increasing keyframe stamps (n,) from span_ns[0] to span_ns[1].
+
+    Aiding epochs win over everything they stand closer to than `merge_s`; inside a gap only aiding adds keyframes.
+    """
+    start, end = span_ns
+    merge = int(config.merge_s * NS)
+    borders = [b for gap in gaps for b in (gap.start_ns, gap.end_ns)]
+    aided = np.unique(np.concatenate([np.zeros(0, np.int64), *aiding]))
+    aided = aided[(aided >= start) & (aided <= end)]
+    aided = aided[np.concatenate([[True], np.diff(aided) > merge])] if len(aided) else aided
+    rest = np.unique(np.array([start, end, *borders], dtype=np.int64))
+    rest = rest[(rest >= start) & (rest <= end)]
+    if len(aided):
+        right = np.clip(np.searchsorted(aided, rest), 1, len(aided)) - 1
+        near = np.minimum(np.abs(rest - aided[right]), np.abs(rest - aided[np.minimum(right + 1, len(aided) - 1)]))
+        rest = rest[near > merge]
+    fixed = np.union1d(aided, rest)
+    return np.union1d(fixed, _fill(fixed, gaps, config.max_spacing_s))
+
+
+def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float) -> Times:
+    """Evenly spaced stamps between those of `fixed` that stand too far apart, outside gaps."""
+    length = np.diff(fixed)
+    parts = np.maximum(np.ceil(length / NS / spacing_s - 1e-9).astype(np.int64), 1)
+    parts[inside(gaps, fixed[:-1] + length // 2)] = 1
+    pieces = [
+        ns_from_seconds(np.arange(1, n) * (step / NS / n)) + begin
+        for begin, step, n in zip(fixed[:-1], length, parts, strict=True)
+        if n > 1
+    ]
+    return np.concatenate([np.zeros(0, np.int64), *pieces])
+
+
+def inside(spans: Sequence[Gap], t_ns: Times) -> NDArray[np.bool_]:
+    """Mask (n,) of the stamps strictly inside one of `spans`."""
+    mask = np.zeros(t_ns.shape, dtype=bool)
+    for span in spans:
+        mask |= (t_ns > span.start_ns) & (t_ns < span.end_ns)
+    return mask
+
+
+def make_windows(
+    imu: Imu,
+    times: Times,
+    gaps: Sequence[Gap],
+    aiding: Mapping[str, Times],
+    config: KeyframeConfig,
+) -> list[Window]:
+    """One window a keyframe; the first has no length.
+
+    Parameters
+    ----------
+    times : (n,) keyframe stamps inside the inertial span
+    gaps : stretches whose windows are of kind ``gap``
+    aiding : stamps of every aiding stream; each row goes to the keyframe it shares its epoch with
+    """
+    grid = np.union1d(imu.t_ns[(imu.t_ns > times[0]) & (imu.t_ns < times[-1])], times)
+    samples = interpolate(grid, imu.t_ns, np.concatenate([imu.accel, imu.gyro], axis=1))
+    means = 0.5 * (samples[1:] + samples[:-1])
+    dt = np.diff(grid) / NS
+    # Preintegration turns the force by the attitude at the interval's start; half the turn of the interval is missing.
+    means[:, :3] += 0.5 * dt[:, None] * np.cross(means[:, 3:], means[:, :3])
+    cut = np.searchsorted(grid, times)
+    in_gap = inside(gaps, times[:-1] + np.diff(times) // 2)
+    rows = _rows_by_keyframe(times, aiding, int(config.merge_s * NS))
+
+    windows = [Window(0, int(times[0]), int(times[0]), "first", dt[:0], means[:0, :3], means[:0, 3:], rows.get(0, {}))]
+    for k in range(1, len(times)):
+        part = slice(cut[k - 1], cut[k])
+        kind = "gap" if in_gap[k - 1] else "normal"
+        windows.append(
+            Window(
+                k, int(times[k - 1]), int(times[k]), kind, dt[part], means[part, :3], means[part, 3:], rows.get(k, {})
+            )
+        )
+    return windows
+
+
+def _rows_by_keyframe(
+    times: Times, aiding: Mapping[str, Times], merge_ns: int
+) -> dict[int, dict[str, NDArray[np.intp]]]:
+    table: dict[int, dict[str, NDArray[np.intp]]] = {}
+    for sensor, stamps in aiding.items():
+        right = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
+        left = np.maximum(right - 1, 0)
+        keyframe = np.where(np.abs(stamps - times[left]) < np.abs(times[right] - stamps), left, right)
+        near = np.abs(stamps - times[keyframe]) <= merge_ns
+        for row in np.flatnonzero(near):
+            slot = table.setdefault(int(keyframe[row]), {})
+            slot[sensor] = np.append(slot.get(sensor, np.zeros(0, np.intp)), row)
+    return table

@@ -1,0 +1,105 @@
+"""States inside windows: inertial prediction from the keyframe before, bent to meet the keyframe after.
+
+Serves output at any rate and the scoring of withheld fixes. The end discrepancy of a window is spread over it: the
+rotation linearly, position and velocity by the cubic that meets both at both ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.graph import Window
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+
+class Kinematics(NamedTuple):
+    """Attitude (n, 3, 3), position (n, 3) m and velocity (n, 3) m/s in nav, with bias (n, 6) accel then gyro."""
+
+    R: Floats
+    p: Floats
+    v: Floats
+    bias: Floats
+
+
+def _exp(vectors: Floats) -> Floats:
+    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def _advance(R: Floats, p: Floats, v: Floats, accel: Floats, gyro: Floats, dt: Floats, g: Floats) -> tuple[Floats, ...]:
+    """One interval for many rows, as preintegration does it (see `keyframes.make_windows` on the half turn)."""
+    a = np.einsum("nij,nj->ni", R, accel) + g
+    return R @ _exp(gyro * dt[:, None]), p + v * dt[:, None] + 0.5 * a * dt[:, None] ** 2, v + a * dt[:, None]
+
+
+def states_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
+    """Smoothed states at arbitrary times inside the windows.
+
+    Parameters
+    ----------
+    windows : all windows in time order; states : the smoothed keyframes, row k at windows[k].t1_ns
+    gravity : m/s^2; t_ns (q,) stamps in [windows[0].t1_ns, windows[-1].t1_ns]
+    """
+    ends = np.array([w.t1_ns for w in windows], dtype=np.int64)
+    index = np.searchsorted(ends, t_ns)
+    if len(t_ns) and (index.max() >= len(windows) or t_ns.min() < ends[0]):
+        raise ValueError("a time outside the windows")
+    out = Kinematics(*(x[index].copy() for x in states))
+    open_rows = np.flatnonzero(ends[index] != t_ns)
+    if len(open_rows):
+        used, where = np.unique(index[open_rows], return_inverse=True)
+        inner = _inside([windows[k] for k in used], used, states, gravity, where, t_ns[open_rows])
+        for target, source in zip(out, inner, strict=True):
+            target[open_rows] = source
+    return out
+
+
+def _inside(
+    windows: Sequence[Window],
+    index: NDArray[np.intp],
+    states: Kinematics,
+    gravity: float,
+    where: NDArray[np.intp],
+    t_ns: NDArray[np.int64],
+) -> Kinematics:
+    count, depth = len(windows), max(len(w.dt) for w in windows)
+    dt = np.zeros((count, depth))
+    accel, gyro = np.zeros((count, depth, 3)), np.zeros((count, depth, 3))
+    for row, w in enumerate(windows):
+        m = len(w.dt)
+        dt[row, :m], accel[row, :m], gyro[row, :m] = w.dt, w.accel, w.gyro
+    bias = states.bias[index - 1]
+    accel -= bias[:, None, :3]
+    gyro -= bias[:, None, 3:]
+    g = np.array([0.0, 0.0, -gravity])
+
+    R = np.empty((depth + 1, count, 3, 3))
+    p, v = np.empty((depth + 1, count, 3)), np.empty((depth + 1, count, 3))
+    R[0], p[0], v[0] = states.R[index - 1], states.p[index - 1], states.v[index - 1]
+    for j in range(depth):
+        R[j + 1], p[j + 1], v[j + 1] = _advance(R[j], p[j], v[j], accel[:, j], gyro[:, j], dt[:, j], g)
+
+    start = np.array([w.t0_ns for w in windows], dtype=np.int64)
+    length = np.array([w.length_s for w in windows])
+    tau = (t_ns - start[where]) / NS
+    border = np.concatenate([np.zeros((count, 1)), np.cumsum(dt, axis=1)], axis=1)
+    j = np.minimum((border[where] <= tau[:, None]).sum(axis=1) - 1, depth - 1)
+    part = tau - border[where, j]
+    Rq, pq, vq = _advance(R[j, where], p[j, where], v[j, where], accel[where, j], gyro[where, j], part, g)
+
+    turn = Rotation.from_matrix(R[depth].transpose(0, 2, 1) @ states.R[index]).as_rotvec()
+    dp, dv = states.p[index] - p[depth], states.v[index] - v[depth]
+    x, T = (tau / length[where])[:, None], length[where][:, None]
+    dp, dv = dp[where], dv[where]
+    return Kinematics(
+        Rq @ _exp(x * turn[where]),
+        pq + dp * (3 * x**2 - 2 * x**3) + dv * T * (x**3 - x**2),
+        vq + dp / T * (6 * x - 6 * x**2) + dv * (3 * x**2 - 2 * x),
+        (1 - x) * states.bias[index - 1][where] + x * states.bias[index][where],
+    )

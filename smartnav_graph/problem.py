@@ -1,0 +1,171 @@
+"""Session + config -> everything the loop needs: windows, builders, gaps, and what was left out on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph import health
+from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.config import Config
+from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
+from smartnav_graph.graph import Builder, Window
+from smartnav_graph.keyframes import keyframe_times, make_windows
+from smartnav_graph.session import Session
+from smartnav_graph.streams import Positioned
+from smartnav_graph.timebase import NS, Gap, find_gaps
+from smartnav_graph.withhold import split
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One estimation problem. `session` lacks the withheld rows; rows of a stream keep their numbers in it."""
+
+    session: Session
+    config: Config
+    calibration: Calibration
+    windows: Sequence[Window]
+    gaps: Sequence[Gap]
+    builders: Sequence[Builder]
+    withheld: Mapping[str, Positioned]
+    dropped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+
+    @property
+    def vehicle(self) -> str:
+        return self.config.run.vehicle or self.session.device.vehicle
+
+
+def prepare(session: Session, config: Config) -> Problem:
+    """Check the session, choose sensors and stretch, find gaps, cut windows, make builders.
+
+    Raises
+    ------
+    SessionError
+        No inertial data, a dead stream, or nothing of an aiding stream inside the inertial span.
+    ConfigError
+        An option names what is not there.
+    """
+    imu = session.require_imu()
+    signal = np.concatenate([imu.gyro, imu.accel], axis=1)
+    g = config.gaps
+    gaps = find_gaps(
+        imu.t_ns,
+        signal,
+        missing_s=g.missing_s,
+        missing_periods=g.missing_periods,
+        bridged_rows=g.bridged_rows,
+        slope_tolerance=g.slope_tolerance,
+    )
+    checked = health.inspect(session)
+    checked.raise_errors()
+    warnings = checked.warnings()
+    session = _choose_sensors(session, config.run.sensors)
+    session, withheld = split(session, config.run.withhold)
+    span = _span(session, config)
+    session, dropped = _inside_span(session, span)
+    aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
+    span, told = _trimmed(span, aiding, config.keyframes.lead_s, session.t0_ns)
+    gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
+    times = keyframe_times(span, list(aiding.values()), gaps, config.keyframes)
+    windows = make_windows(imu, times, gaps, aiding, config.keyframes)
+    calibration = session.calibration or Calibration()
+    context = FactorContext(session, calibration, gaps, config.imu, config.gnss, config.control)
+    builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
+    for name, counts in session.dropped.items():
+        dropped[name] = {**dropped.get(name, {}), **counts}
+    warnings = [*warnings, *told, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
+    return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings)
+
+
+def _choose_sensors(session: Session, chosen: Sequence[str]) -> Session:
+    """Only the named sensors, or all but those with a leading minus; the inertial data always stay."""
+    if not chosen:
+        return session
+    there = session.streams()
+    names = {name.lstrip("-") for name in chosen}
+    unknown = sorted(names - set(there))
+    if unknown:
+        raise ConfigError("--sensors", f"{', '.join(unknown)} not in this session", f"some of {', '.join(there)}")
+    wanted = {name for name in chosen if not name.startswith("-")}
+    unwanted = {name[1:] for name in chosen if name.startswith("-")}
+    keep = (wanted or set(there)) - unwanted | {"imu", "reference", "images"}
+    return session.replace(**{name: None for name in there if name not in keep})
+
+
+def _span(session: Session, config: Config) -> tuple[int, int]:
+    """Stretch asked for, inside the inertial span."""
+    imu = session.require_imu()
+    t0, last = session.t0_ns, int(imu.t_ns[-1])
+    run = config.run
+    start = t0 if run.start_s is None else t0 + round(run.start_s * NS)
+    end = last if run.end_s is None else t0 + round(run.end_s * NS)
+    start, end = max(start, t0), min(end, last)
+    if start >= end:
+        raise ConfigError(
+            "--from, --to",
+            f"nothing between {run.start_s} and {run.end_s} s",
+            f"a stretch inside 0 to {(last - t0) / NS:.2f} s",
+        )
+    return start, end
+
+
+def _inside_span(session: Session, span: tuple[int, int]) -> tuple[Session, dict[str, dict[str, int]]]:
+    """Absolute streams cut to the span. Rows beyond the inertial data are counted, rows beyond --from/--to are not."""
+    imu = session.require_imu()
+    dropped: dict[str, dict[str, int]] = {}
+    changes: dict[str, Positioned | None] = {}
+    for name in ABSOLUTE:
+        stream = getattr(session, name)
+        if stream is None:
+            continue
+        outside = int(((stream.t_ns < imu.t_ns[0]) | (stream.t_ns > imu.t_ns[-1])).sum())
+        if outside:
+            dropped[name] = {"outside the inertial span": outside}
+        inside = (stream.t_ns >= span[0]) & (stream.t_ns <= span[1])
+        changes[name] = stream.take(inside) if inside.any() else None
+        if outside == len(stream):
+            raise SessionError(
+                name,
+                f"all {outside} rows lie outside the inertial span",
+                f"stamps between {imu.t_ns[0]} and {imu.t_ns[-1]} ns",
+                "bring both on one clock",
+                stream=name,
+            )
+    return session.replace(**changes), dropped
+
+
+def _trimmed(
+    span: tuple[int, int], aiding: Mapping[str, NDArray[np.int64]], lead_s: float, t0_ns: int
+) -> tuple[tuple[int, int], list[str]]:
+    """The span, cut to `lead_s` before the first and after the last aiding: dead reckoning beyond says little."""
+    if not aiding:
+        return span, []
+    lead = round(lead_s * NS)
+    first = min(int(t[0]) for t in aiding.values()) - lead
+    last = max(int(t[-1]) for t in aiding.values()) + lead
+    new = max(span[0], first), min(span[1], last)
+    if new == span:
+        return span, []
+    text = (
+        f"keyframes: smoothed from {(new[0] - t0_ns) / NS:.1f} to {(new[1] - t0_ns) / NS:.1f} s only, {lead_s:g} s "
+        "around the first and last absolute measurement; raise keyframes.lead_s to reckon further"
+    )
+    return new, [text]
+
+
+def _unused(session: Session) -> list[str]:
+    """Streams that are there but have no factor."""
+    used = {*BUILDERS, "reference", "images"}
+    idle = [name for name in session.streams() if name not in used]
+    return [f"{name}: present, not used by the estimator" for name in idle]
+
+
+def _dropped_text(name: str, counts: Mapping[str, int]) -> str:
+    return (
+        f"{name}: " + ", ".join(f"{count} rows {reason}" for reason, count in counts.items()) + "; not used as recorded"
+    )

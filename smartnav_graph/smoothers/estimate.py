@@ -1,0 +1,119 @@
+"""States and covariances out of GTSAM values, and the linear algebra that all smoothers share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SolverError
+from smartnav_graph.graph import KEYFRAME_LETTERS, State, Tag, key, nested_order
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a smoother ends with.
+
+    values : gtsam.Values at the solution; indices, t_ns : keyframes, in time order
+    covariance : (n, 15, 15) rotation, position, velocity (nav axes), accelerometer and gyroscope bias (body axes)
+    factors : every factor with its tag; iterations, converged, cost : of the last solve
+    """
+
+    values: Any
+    indices: Sequence[int]
+    t_ns: NDArray[np.int64]
+    covariance: Floats
+    factors: Sequence[tuple[Tag, Any]]
+    iterations: int
+    converged: bool
+    cost: float
+
+    def states(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """nav_R_body (n, 3, 3), nav_t_body (n, 3), nav_v_body (n, 3), bias (n, 6) accelerometer then gyroscope."""
+        return states_of(self.values, self.indices)
+
+
+def state_at(values: Any, index: int, t_ns: int) -> State:
+    """The navigation state and bias of one keyframe."""
+    pose = values.atPose3(key("X", index))
+    return State(
+        index, t_ns, gtsam.NavState(pose, values.atVector(key("V", index))), values.atConstantBias(key("B", index))
+    )
+
+
+def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Arrays of the keyframe states; see `Estimate.states`."""
+    poses = [values.atPose3(key("X", i)).matrix() for i in indices]
+    stacked = np.array(poses).reshape(-1, 4, 4)
+    velocity = np.array([values.atVector(key("V", i)) for i in indices]).reshape(-1, 3)
+    bias = np.array([values.atConstantBias(key("B", i)).vector() for i in indices]).reshape(-1, 6)
+    return stacked[:, :3, :3], stacked[:, :3, 3], velocity, bias
+
+
+def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
+    """Largest distance m and rotation angle deg over the keyframes of two estimates of the same problem."""
+    (Ra, pa, _, _), (Rb, pb, _, _) = one.states(), other.states()
+    trace = np.einsum("nij,nij->n", Ra, Rb)
+    sine = np.linalg.norm(Ra - Rb, axis=(1, 2)) / np.sqrt(8.0)  # of half the angle: exact where the cosine is flat
+    angle = np.where(trace > 0, 2.0 * np.arcsin(np.clip(sine, 0, 1)), np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
+
+
+def elimination_order(indices: Sequence[int], extra: Iterable[int] = ()) -> gtsam.Ordering:
+    """Chain states at once with their keyframe, keyframes by nested dissection, session states last."""
+    order = gtsam.Ordering()
+    for index in nested_order(indices):
+        for letter in KEYFRAME_LETTERS:
+            order.push_back(key(letter, index))
+    for name in extra:
+        order.push_back(name)
+    return order
+
+
+def nav_covariances(tree: Any, values: Any, indices: Sequence[int]) -> Floats:
+    """Joint covariance (n, 15, 15) of every keyframe from an eliminated graph, rotated to nav axes.
+
+    GTSAM's pose covariance is [rotation, translation] in body axes (the tangent of a right retraction).
+    """
+    joint = np.empty((len(indices), 15, 15))
+    for row, index in enumerate(indices):
+        marginal = tree.jointMarginalCovariance([key(letter, index) for letter in KEYFRAME_LETTERS])
+        joint[row] = marginal.fullMatrix()
+    return to_nav_axes(joint, states_of(values, indices)[0])
+
+
+def to_nav_axes(joint: Floats, nav_R_body: Floats) -> Floats:
+    """Rotate the pose part of joint covariances (n, 15, 15) from body to nav axes."""
+    turn = np.zeros_like(joint)
+    turn[:, :3, :3] = turn[:, 3:6, 3:6] = nav_R_body
+    turn[:, range(6, 15), range(6, 15)] = 1.0
+    covariance = turn @ joint @ turn.transpose(0, 2, 1)
+    return 0.5 * (covariance + covariance.transpose(0, 2, 1))
+
+
+_NEAR = re.compile(r"Symbol: (\w)(\d+)")
+
+
+def indeterminate(error: Exception, t_ns: dict[int, int], t0_ns: int, touching: dict[int, set[str]]) -> SolverError:
+    """GTSAM's complaint about an under-determined state, in words: which, when, what touches it, what is missing."""
+    text = str(error)
+    found = _NEAR.search(text)
+    if found is None:
+        return SolverError("solve", text.strip().splitlines()[0] if text.strip() else "failed", "a solvable graph")
+    letter, index = found[1].upper(), int(found[2])
+    names = {"X": "position or attitude", "V": "velocity", "B": "an inertial bias"}
+    when = (t_ns[index] - t0_ns) / 1e9 if index in t_ns else float("nan")
+    sensors = ", ".join(sorted(touching.get(index, set()))) or "nothing"
+    return SolverError(
+        f"t = {when:.2f} s",
+        f"{names.get(letter, letter)} is not determined there (keyframe {index}, touched by {sensors})",
+        "an absolute measurement nearby",
+        "add position fixes, control points or standstills, or give --initial",
+    )

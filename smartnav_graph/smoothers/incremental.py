@@ -1,0 +1,152 @@
+"""One step at a time: iSAM2 over everything, or over a lag with the rest marginalised.
+
+QR factorisation, because Cholesky gives up on yaw that is only weakly known (Kaess et al. 2012, iSAM2, IJRR 31(2)).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError, SolverError
+from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
+from smartnav_graph.smoothers.estimate import Estimate, elimination_order, indeterminate, nav_covariances, to_nav_axes
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """smoother : fixed-lag or isam2; lag_s; relinearize_threshold : step size that moves a linearisation point;
+    polish : solve everything once more at the end."""
+
+    smoother: str = "fixed-lag"
+    lag_s: float = 10.0
+    relinearize_threshold: float = 0.1
+    polish: bool = True
+
+    def __post_init__(self) -> None:
+        if self.smoother not in ("fixed-lag", "isam2"):
+            raise ConfigError("--smoother", f"{self.smoother!r}", "fixed-lag or isam2")
+        if not (self.lag_s > 0 and self.relinearize_threshold > 0):
+            raise ConfigError("config [replay]", f"lag_s = {self.lag_s}", "> 0 s")
+
+
+def isam2_params(threshold: float) -> gtsam.ISAM2Params:
+    """iSAM2 with QR and relinearisation at every step that needs it."""
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    params.setRelinearizeThreshold(threshold)
+    params.relinearizeSkip = 1
+    return params
+
+
+class Incremental:
+    """iSAM2 or fixed-lag smoother behind the one interface."""
+
+    def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
+        self.config, self.t0_ns = config, t0_ns
+        params = isam2_params(config.relinearize_threshold)
+        self._fixed_lag = config.smoother == "fixed-lag"
+        self._engine: Any = (
+            gtsam.IncrementalFixedLagSmoother(config.lag_s, params) if self._fixed_lag else gtsam.ISAM2(params)
+        )
+        self.steps: list[Step] = []
+        self._left = gtsam.Values()
+        self._inside: deque[Step] = deque()
+
+    def latest(self) -> State | None:
+        """State at the last keyframe, with everything known so far."""
+        if not self.steps:
+            return None
+        return self._state(self.steps[-1])
+
+    def _state(self, step: Step) -> State:
+        i, engine = step.index, self._engine
+        pose = engine.calculateEstimatePose3(key("X", i))
+        velocity = engine.calculateEstimateVector(key("V", i))
+        return State(i, step.t_ns, gtsam.NavState(pose, velocity), engine.calculateEstimateConstantBias(key("B", i)))
+
+    def update(self, step: Step) -> None:
+        """Take one step.
+
+        Raises
+        ------
+        SolverError
+            The new state is not determined; names time, state and sensors.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor in step.factors:
+            graph.push_back(factor)
+        self._make_room(step)
+        try:
+            if self._fixed_lag:
+                stamps = {key(letter, step.index): step.t_s for letter in KEYFRAME_LETTERS}
+                self._engine.update(graph, step.values(), stamps)
+            else:
+                self._engine.update(graph, step.values())
+        except RuntimeError as error:
+            t_ns = {s.index: s.t_ns for s in [*self.steps, step]}
+            touching = {s.index: {tag.sensor for tag, _ in s.factors} for s in [*self.steps, step]}
+            raise indeterminate(error, t_ns, self.t0_ns, touching) from error
+        self.steps.append(step)
+        self._inside.append(step)
+
+    def _make_room(self, step: Step) -> None:
+        """Keep the last estimate of the states that the coming update marginalises."""
+        while self._fixed_lag and self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
+            _insert(self._left, self._state(self._inside.popleft()))
+
+    def covariance(self) -> Floats:
+        """(15, 15) of the latest keyframe, nav axes; blocks of pose, velocity and bias."""
+        i = self.steps[-1].index
+        joint = np.zeros((1, 15, 15))
+        at = 0
+        for letter, size in (("X", 6), ("V", 3), ("B", 6)):
+            joint[0, at : at + size, at : at + size] = self._engine.marginalCovariance(key(letter, i))
+            at += size
+        R = self._engine.calculateEstimatePose3(key("X", i)).rotation().matrix()
+        return np.asarray(to_nav_axes(joint, R[None])[0])
+
+    def values(self) -> Any:
+        """Best estimate of every keyframe (gtsam.Values): as it left the lag, or as it is now."""
+        if not self._fixed_lag:
+            return self._engine.calculateBestEstimate()
+        values = gtsam.Values(self._left)
+        for step in self._inside:
+            _insert(values, self._state(step))
+        return values
+
+    def estimate(self, count: int | None = None) -> Estimate:
+        """The first `count` keyframes (all by default) at `values`, with the covariance of their graph linearised
+        there."""
+        steps = self.steps[:count]
+        if not steps:
+            raise SolverError("replay", "no keyframe was processed", "at least one")
+        graph = gtsam.NonlinearFactorGraph()
+        for step in steps:
+            for _, factor in step.factors:
+                graph.push_back(factor)
+        values, indices = self.values(), [step.index for step in steps]
+        tree = graph.linearize(values).eliminateMultifrontal(elimination_order(indices), gtsam.EliminateQR)
+        return Estimate(
+            values=values,
+            indices=indices,
+            t_ns=np.array([step.t_ns for step in steps], dtype=np.int64),
+            covariance=nav_covariances(tree, values, indices),
+            factors=[item for step in steps for item in step.factors],
+            iterations=len(steps),
+            converged=True,
+            cost=graph.error(values),
+        )
+
+
+def _insert(values: Any, state: State) -> None:
+    values.insert(key("X", state.index), state.nav.pose())
+    values.insert(key("V", state.index), state.nav.velocity())
+    values.insert(key("B", state.index), state.bias)

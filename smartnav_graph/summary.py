@@ -1,0 +1,156 @@
+"""What happened in one run, as summary.json tells it."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.assemble import Withheld, used_counts
+from smartnav_graph.graph import Memory
+from smartnav_graph.initialise import Initial
+from smartnav_graph.problem import Problem
+from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.solution import POS, Solution
+
+PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
+STATE_DIM = 15
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the result depends on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def peak_memory_mb() -> float:
+    """Largest resident set of this process, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
+
+
+def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution: Solution) -> dict[str, float]:
+    """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
+
+    The redundancy of a fix is what its posterior leaves of its variance; the inertial factors have the rest.
+    """
+    rows = {
+        sensor: solution.residuals.of(sensor) & solution.residuals.used for sensor in set(solution.residuals.sensor)
+    }
+    squares = {
+        sensor: float((solution.residuals.weight[mask] * solution.residuals.whitened[mask] ** 2).sum())
+        for sensor, mask in rows.items()
+    }
+    count = sum(int(mask.sum()) for mask in rows.values())
+    total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
+    result = {"overall": sum(squares.values()) / total}
+    left = float(total)
+    for builder in position_builders(problem.builders):
+        found = fix_residuals(builder, problem.windows, estimate, memory)
+        used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
+        redundancy = float(np.clip(1.0 - found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0).sum())
+        left -= redundancy
+        if redundancy > 0.5:
+            result[builder.name] = squares.get(builder.name, 0.0) / redundancy
+    inertial = squares.get("imu", 0.0) + squares.get("imu_bias", 0.0)
+    if left > 0.5:
+        result["imu"] = inertial / left
+    return {name: round(value, 5) for name, value in result.items()}
+
+
+def summarise(
+    problem: Problem,
+    initial: Initial,
+    estimate: Estimate,
+    memory: Memory,
+    keyframes: Solution,
+    withheld: Mapping[str, Withheld],
+    timings: Mapping[str, float],
+    extra: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The content of summary.json; `extra` overrides and adds."""
+    t0 = problem.session.t0_ns
+    duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
+    factors: dict[str, int] = {}
+    for tag, _ in estimate.factors:
+        factors[tag.sensor] = factors.get(tag.sensor, 0) + 1
+    absolute = bool(used_counts(problem, memory))
+    warnings = list(problem.warnings)
+    if not absolute:
+        warnings.append(
+            "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
+        )
+    if not estimate.converged:
+        warnings.append("solve: the iteration limit was reached before the cost settled; raise batch.max_iterations")
+    summary: dict[str, Any] = {
+        "mode": "batch" if absolute else "dead-reckoning",
+        "vehicle": problem.vehicle,
+        "session": {
+            "device": problem.session.device.name,
+            "clock_epoch": problem.session.clock_epoch,
+            "t0_ns": t0,
+            "forward": problem.session.device.forward,
+            "up": problem.session.device.up,
+            "gravity_m_s2": problem.session.gravity,
+        },
+        "duration_s": duration,
+        "path_m": keyframes.path_length(),
+        "keyframes": len(keyframes),
+        "factors": factors,
+        "chi2_per_dof": _chi2_per_dof(problem, estimate, memory, keyframes),
+        "iterations": estimate.iterations,
+        "converged": estimate.converged,
+        "cost": estimate.cost,
+        "states": _states(problem, memory),
+        "timings_s": {name: round(value, 4) for name, value in timings.items()},
+        "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "gaps": [
+            {"start_s": round((gap.start_ns - t0) / 1e9, 3), "length_s": round(gap.length_s, 3), "kind": gap.kind}
+            for gap in problem.gaps
+        ],
+        "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
+        "used": dict(used_counts(problem, memory)),
+        "rejected": {name: len(rows) for name, rows in memory.rejected.items()},
+        "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
+        "position_sigma_m": _sigma_summary(keyframes),
+        "initialisation": initial.to_dict(),
+        "warnings": warnings,
+        "versions": versions(),
+    }
+    return summary | dict(extra)
+
+
+def _states(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
+    """Noise found on the way, beside the states of the session."""
+    found = {}
+    for builder in position_builders(problem.builders):
+        if builder.name in memory.noise_scales:
+            sigma = builder.scaled_sigma(memory)[~builder.own_sigma]
+            found[f"{builder.name}_sigma_m"] = {
+                "value": [round(float(s), 4) for s in sigma[0]],
+                "sigma": None,
+                "held": False,
+            }
+    return found
+
+
+def _sigma_summary(solution: Solution) -> dict[str, float]:
+    """Horizontal one-sigma: median, 95 % and largest, metres."""
+    horizontal = np.hypot(*solution.sigmas[:, POS][:, :2].T)
+    return {
+        "median": float(np.median(horizontal)),
+        "p95": float(np.percentile(horizontal, 95)),
+        "max": float(horizontal.max()),
+    }
