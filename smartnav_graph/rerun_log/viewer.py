@@ -58,7 +58,9 @@ def view(paths: Iterable[str | Path], web: bool = False) -> None:
         _require_display()
     with tempfile.TemporaryDirectory(prefix="smartnav-view-") as scratch:
         files = recordings(paths, Path(scratch))
-        command = [str(executable()), *(["--web-viewer"] if web else []), *(str(file.resolve()) for file in files)]
+        # Only this machine may connect: the viewer listens to the whole network otherwise.
+        options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
+        command = [str(executable()), *options, *(str(file.resolve()) for file in files)]
         code = subprocess.run(command, check=False).returncode
     if code not in (0, -2, 130):  # closed, or interrupted by the user
         raise SmartnavError("Rerun viewer", f"ended with code {code}", "0", "read its messages above, or try --web")
