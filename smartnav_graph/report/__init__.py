@@ -14,11 +14,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from smartnav_graph.files import replacing
 from smartnav_graph.report import facts
+from smartnav_graph.report.charts import Scored
 from smartnav_graph.report.sections import page
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
@@ -34,7 +32,7 @@ def write_report(
     summary: Mapping[str, Any],
     evaluation: Any = None,
     causal: Solution | None = None,
-    withheld: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]] | None = None,
+    withheld: Mapping[str, Scored] | None = None,
 ) -> None:
     """Write the report of one run as a single HTML file; what stood at `path` is replaced.
 
@@ -47,7 +45,7 @@ def write_report(
     evaluation : comparison with a reference: ``to_dict()``, and per epoch ``t_ns`` (n,), ``error_enu_m`` (n, 3),
         ``rotation_error_deg`` (n,), ``sigma_enu`` (n, 3)
     causal : the states as each became known while replaying
-    withheld : by sensor, times (n,) int64 and errors (n, 3) m east, north, up at withheld measurements
+    withheld : by sensor, errors at withheld measurements: ``t_ns`` (n,) int64 and ``error`` (n, 3) m east, north, up
 
     Raises
     ------

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +17,20 @@ from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
 
 Floats = NDArray[np.float64]
 Intervals = Sequence[tuple[float, float]]
-Scored = Mapping[str, tuple[NDArray[np.int64], Floats]]
 
 AXES = ("East", "North", "Up")
+
+
+class Scored(Protocol):
+    """Errors at the withheld rows of one sensor: `t_ns` (n,) and `error` (n, 3) m, nav axes."""
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]: ...
+
+    @property
+    def error(self) -> Floats: ...
+
+
 MOST_FAR = 6.0  # whitened residuals beyond are drawn at the edge and counted
 
 
@@ -219,9 +230,9 @@ def distribution(errors: ArrayLike, what: str) -> str:
     return figure([plot], note=f"{count(len(e))} {what}.")
 
 
-def withheld(name: str, t_ns: NDArray[np.int64], error: Floats, solution: Solution, gaps: Intervals) -> str:
+def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> str:
     """Horizontal errors at withheld measurements: their distribution, and over time beside the estimated sigma."""
-    horizontal = np.linalg.norm(np.asarray(error, dtype=np.float64)[:, :2], axis=1)
+    horizontal = np.linalg.norm(np.asarray(scored.error, dtype=np.float64)[:, :2], axis=1)
     picture = distribution(horizontal, f"withheld {sensor_name(name)} measurements")
     if len(solution) < 2 or not len(finite(horizontal)):
         return picture
@@ -229,7 +240,7 @@ def withheld(name: str, t_ns: NDArray[np.int64], error: Floats, solution: Soluti
     y = axis(np.concatenate([horizontal, finite(sigma)]), include=(0.0,))
     plot = _over_time(solution, y, "Horizontal error [m]", gaps)
     plot.line(solution.seconds, sigma, "s3")
-    plot.dots((np.asarray(t_ns) - solution.t0_ns) / 1e9, horizontal, "held")
+    plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "held")
     marks = [("dots held", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *_shaded(gaps)]
     return picture + figure([plot], marks)
 

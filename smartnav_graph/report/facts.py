@@ -27,6 +27,7 @@ Summary = Mapping[str, Any]
 
 SENSORS = {
     "imu": ("IMU", "IMU sample", "IMU samples"),
+    "imu_bias": ("IMU bias walk", "bias step", "bias steps"),
     "gnss": ("GNSS", "GNSS fix", "GNSS fixes"),
     "control": ("Control points", "control point", "control points"),
     "pose_fixes": ("Pose fixes", "pose fix", "pose fixes"),
@@ -95,11 +96,13 @@ def headline(summary: Summary, certainty: Certainty | None = None) -> list[str]:
 
 def _what(summary: Summary) -> str:
     mode = str(summary.get("mode") or "")
-    done = MODES.get(mode, "smoothed" if not mode else f"processed ({mode})")
+    kind, _, how = mode.partition(" ")
+    done = MODES.get(kind, f"processed ({kind})") if mode else "smoothed"
+    done += f" ({how})" if how else ""
     over = f" over {distance(summary['path_m'])}" if as_float(summary.get("path_m")) is not None else ""
     long = f" of {duration(summary['duration_s'])}" if as_float(summary.get("duration_s")) is not None else ""
     at = f" at {plural(summary['keyframes'], 'epoch')}" if as_float(summary.get("keyframes")) is not None else ""
-    tail = "; nothing ties it to an absolute position, so its uncertainty grows with time" * (mode == "dead-reckoning")
+    tail = "; nothing ties it to an absolute position, so its uncertainty grows with time" * (kind == "dead-reckoning")
     return f"The recording{long}{over} was {done}{at}{tail}."
 
 
@@ -283,6 +286,7 @@ def solver_table(summary: Summary) -> Table:
     converged = "yes" if summary.get("converged") else "no"
     entries = [
         ("Converged", "converged", converged),
+        ("Passes", "passes", count(summary.get("passes"))),
         ("Iterations", "iterations", count(summary.get("iterations"))),
         ("χ² per degree of freedom", "chi2_per_dof", number(room(summary, "chi2_per_dof").get("overall"))),
         ("Times faster than the recording", "real_time_factor", _speed(summary)),
@@ -291,9 +295,15 @@ def solver_table(summary: Summary) -> Table:
             "update_ms",
             " / ".join(number(update.get(k)) for k in ("median", "p99", "max")) + " ms",
         ),
+        ("Data seen before the first output", "delay_s", seconds(summary.get("delay_s"))),
+        ("Largest change by the final polish", "polish", _polish(room(summary, "polish"))),
         ("Peak memory", "peak_memory_mb", f"{count(summary.get('peak_memory_mb'))} MB"),
     ]
     return Table(("", ""), [Row([label, text]) for label, key, text in entries if summary.get(key) not in (None, {})])
+
+
+def _polish(change: Mapping[str, Any]) -> str:
+    return f"{metres(change.get('largest_change_m'))}, {number(change.get('largest_change_deg'))}°"
 
 
 def _speed(summary: Summary) -> str:

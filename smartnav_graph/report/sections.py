@@ -43,7 +43,7 @@ def page(
     summary: Summary,
     evaluation: Any,
     causal: Solution | None,
-    scored: charts.Scored,
+    scored: Mapping[str, charts.Scored],
 ) -> str:
     """The whole HTML text."""
     holes = facts.gaps(summary)
@@ -83,16 +83,17 @@ def contents(body: str) -> str:
 
 def head(session: Session, solution: Solution, summary: Summary) -> str:
     """Title, headline sentences, the figures that matter most."""
-    name = session.path.name if session.path else "Recorded session"
+    device = "" if session.device.name == "unknown" else session.device.name
+    name = session.path.name if session.path else device or "Recorded session"
     sure = statistics.certainty(solution)
     sentences = " ".join(escape(s) for s in facts.headline(summary, sure))
     tiles = "".join(
         f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>"
         for label, value in statistics.key_figures(summary, sure)
     )
-    device = "" if session.device.name == "unknown" else f" · {session.device.name}"
+    kicker = f"smartnav run report · {device}" if session.path and device else "smartnav run report"
     return (
-        f'<header id="headline"><p class="kicker">{escape("smartnav run report" + device)}</p><h1>{escape(name)}</h1>'
+        f'<header id="headline"><p class="kicker">{escape(kicker)}</p><h1>{escape(name)}</h1>'
         f'<p class="lead">{sentences}</p><dl class="tiles">{tiles}</dl>{sigma_sentence(solution)}</header>'
     )
 
@@ -181,12 +182,12 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
     return [*parts, section("residuals", "Residuals", both)]
 
 
-def withheld(summary: Summary, scored: charts.Scored, solution: Solution, gaps: charts.Intervals) -> str:
+def withheld(summary: Summary, scored: Mapping[str, charts.Scored], solution: Solution, gaps: charts.Intervals) -> str:
     """Measurements kept from the estimate and scored against it."""
     table = facts.withheld_table(summary)
     if not table:
         return ""
-    pictures = [charts.withheld(name, *rows, solution, gaps) for name, rows in scored.items()]
+    pictures = [charts.withheld(name, rows, solution, gaps) for name, rows in scored.items()]
     lead = "<p>These measurements were kept from the estimate, then compared with it.</p>"
     total = {"count": round(sum(as_float(n) or 0.0 for n in facts.withheld_counts(summary).values()))}
     return section("withheld", "Withheld measurements", lead + table.html() + "".join(pictures), total)

@@ -56,6 +56,14 @@ class Compared:
         }
 
 
+@dataclass(frozen=True)
+class Scored:
+    """Stands for the errors at withheld rows."""
+
+    t_ns: Any
+    error: Any
+
+
 def drive(n: int = 470) -> Drive:
     """`n` keyframes at 1 Hz: a town loop of straights and bends, with two stops."""
     rng = np.random.default_rng(3)
@@ -142,7 +150,7 @@ def _causal(solution: Solution, rng: np.random.Generator) -> Solution:
 
 def _withheld(solution: Solution, rng: np.random.Generator) -> dict[str, Any]:
     rows = slice(1, None, 2)
-    return {"gnss": (solution.t_ns[rows], rng.normal(size=(len(solution), 3))[rows] * 0.2)}
+    return {"gnss": Scored(solution.t_ns[rows], rng.normal(size=(len(solution), 3))[rows] * 0.2)}
 
 
 def _compared(solution: Solution, rng: np.random.Generator) -> Compared:

@@ -81,7 +81,7 @@ def test_used_rejected_dropped_withheld(dom) -> None:
 
 
 def test_withheld_errors_are_shown_one_by_one(dom, case) -> None:
-    horizontal = np.linalg.norm(case.withheld["gnss"][1][:, :2], axis=1)
+    horizontal = np.linalg.norm(case.withheld["gnss"].error[:, :2], axis=1)
     assert f"95 %: {np.percentile(horizontal, 95):.3f} m" in words(section(dom, "withheld"))
     (dots,) = section(dom, "withheld").xpath('.//svg[@class="box"]/path[contains(@class, "held")]/@d')
     assert dots.count("M") == len(horizontal)
@@ -160,6 +160,16 @@ def test_failed_solve_stands_in_headline_and_warnings(tmp_path, case) -> None:
 def test_dead_reckoning_is_named(tmp_path, case) -> None:
     dom = written(tmp_path, case, summary={"mode": "dead-reckoning"})
     assert "nothing ties it to an absolute position" in words(section(dom, "headline"))
+
+
+def test_replay_tells_its_kind_delay_and_polish(tmp_path, case) -> None:
+    polish = {"largest_change_m": 0.0213, "largest_change_deg": 0.05, "passes": 2}
+    extra = {"mode": "replay fixed-lag, interrupted", "delay_s": 29.9, "polish": polish}
+    dom = written(tmp_path, case, summary=summary() | extra)
+    assert "was replayed one window at a time (fixed-lag, interrupted)" in words(section(dom, "headline"))
+    text = words(section(dom, "solver"))
+    assert "Data seen before the first output 29.9 s" in text
+    assert "final polish 0.021 m, 0.0500°" in text
 
 
 def test_bare_solution(tmp_path, case) -> None:
