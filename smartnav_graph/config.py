@@ -30,7 +30,7 @@ class GapConfig:
     missing_s: float = 0.05
     missing_periods: float = 3.0
     bridged_rows: int = 5
-    slope_tolerance: float = 1e-3
+    straightness: float = 1e-3
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,9 @@ from smartnav_graph.timebase import NS, seconds_since
 
 Floats = NDArray[np.float64]
 
+# Cost a keyframe above which a fit of the first stretch is bad (a good one has about one).
+GOOD_COST = 5.0
+
 
 @dataclass(frozen=True)
 class InitialiseConfig:
@@ -311,19 +314,41 @@ class Initialiser:
         return Initial(prior, "static", sentence, heading, sigma, rest.length_s, 1, Memory())
 
     def _search(self, solve: Solve, rest: Rest | None) -> Initial:
-        """Solve the first stretch from one start, from starts all round if that leaves doubt, longer if it still does."""
-        stretch = self.config.stretch_s
+        """Solve the first stretch from the likeliest start; a longer one while the heading stays open; from starts
+        all round where the fit is bad or the stretch cannot grow."""
+        stretch, tried = self.config.stretch_s, 0
         while True:
             count = self._count(stretch)
-            best, tried = self._best(solve, count, rest)
-            sigma = best.sigma_heading_deg
-            if (
-                sigma < self.config.good_heading_deg
-                or stretch >= self.config.max_stretch_s
-                or count >= len(self.windows)
-            ):
-                return replace(best, starts=tried)
+            last = stretch >= self.config.max_stretch_s or count >= len(self.windows)
+            results: list[tuple[float, Initial]] = []
+            for state in self._starts(count, rest):
+                tried += 1
+                results += self._attempt(solve, state, rest, count)
+                if len(results) == 1 and results[0][0] < GOOD_COST * count and (self._sure(results[0][1]) or not last):
+                    break
+            if results:
+                best = min(results, key=lambda item: item[0])[1]
+                if last or self._sure(best):
+                    return replace(best, starts=tried)
+            elif last:
+                raise SolverError(
+                    "initialisation",
+                    f"no start converges on the first {count} keyframes",
+                    "inertial data and fixes of the same motion",
+                    'check units, axes and clocks with `smartnav info`, or give --initial "e,n,u,heading_deg"',
+                )
             stretch *= 2.0
+
+    def _sure(self, initial: Initial) -> bool:
+        return initial.sigma_heading_deg < self.config.good_heading_deg
+
+    def _attempt(self, solve: Solve, state: State, rest: Rest | None, count: int) -> list[tuple[float, Initial]]:
+        """Cost and start refined from `state`; nothing where it does not converge."""
+        try:
+            estimate, memory = solve(self._prior(state, rest), count)
+        except SolverError:
+            return []
+        return [(estimate.cost, self._found(estimate, memory, rest, count))] if estimate.converged else []
 
     def _count(self, stretch_s: float) -> int:
         """Windows up to `stretch_s` after the first fix."""
@@ -331,32 +356,10 @@ class Initialiser:
         ends = np.array([w.t1_ns for w in self.windows])
         return int(np.searchsorted(ends, begin + int(stretch_s * NS), side="right"))
 
-    def _best(self, solve: Solve, count: int, rest: Rest | None) -> tuple[Initial, int]:
-        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
-        results: list[tuple[float, Initial]] = []
-        tried = 0
-        for state in self._starts(count, rest, magnetic):
-            tried += 1
-            try:
-                estimate, memory = solve(self._prior(state, rest), count)
-            except SolverError:
-                continue
-            results.append((estimate.cost, self._found(estimate, memory, rest, count, magnetic is not None)))
-            sure = results[-1][1].sigma_heading_deg < self.config.good_heading_deg
-            if tried == 1 and sure and estimate.converged and estimate.cost < 5.0 * count:
-                break
-        if not results:
-            raise SolverError(
-                "initialisation",
-                f"no start converges on the first {count} keyframes",
-                "inertial data and fixes of the same motion",
-                'check units, axes and clocks with `smartnav info`, or give --initial "e,n,u,heading_deg"',
-            )
-        return min(results, key=lambda item: item[0])[1], tried
-
-    def _starts(self, count: int, rest: Rest | None, magnetic: float | None) -> list[State]:
+    def _starts(self, count: int, rest: Rest | None) -> list[State]:
         """First states to try: the inertial curve laid on the fixes, then headings all round."""
         windows = self.windows[:count]
+        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
         t_ns, fixes = self.fixes
         used = t_ns <= windows[-1].t1_ns
         t_ns, fixes = t_ns[used], fixes[used]
@@ -383,7 +386,7 @@ class Initialiser:
             starts.append(self._state(R, p0, v0, rest))
         return starts
 
-    def _found(self, estimate: Estimate, memory: Memory, rest: Rest | None, count: int, magnetic: bool) -> Initial:
+    def _found(self, estimate: Estimate, memory: Memory, rest: Rest | None, count: int) -> Initial:
         """The refined start: its values, under the weak prior (the fixes are used again by the smoother)."""
         R, p, v, bias = (rows[0] for rows in estimate.states())
         state = State(
@@ -396,6 +399,7 @@ class Initialiser:
         sigma = float(np.degrees(np.sqrt(estimate.covariance[0, 2, 2])))
         stretch = (self.windows[count - 1].t1_ns - self.windows[0].t1_ns) / NS
         method = "static" if rest is not None else "dynamic"
+        magnetic = rest is not None and self.magnetometer is not None
         source = "the magnetometer and the fixes" if magnetic else "the fixes and the inertial data"
         vertical = (
             f"vertical and gyro bias from a rest of {rest.length_s:.1f} s"

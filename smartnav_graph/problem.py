@@ -59,7 +59,7 @@ def prepare(session: Session, config: Config) -> Problem:
         missing_s=g.missing_s,
         missing_periods=g.missing_periods,
         bridged_rows=g.bridged_rows,
-        slope_tolerance=g.slope_tolerance,
+        straightness=g.straightness,
     )
     checked = health.inspect(session)
     checked.raise_errors()

@@ -108,14 +108,15 @@ def find_gaps(
     missing_s: float = 0.05,
     missing_periods: float = 3.0,
     bridged_rows: int = 5,
-    slope_tolerance: float = 1e-3,
+    straightness: float = 1e-3,
 ) -> list[Gap]:
     """Find missing and straight-line-filled stretches of a sampled signal.
 
     Missing: a step longer than both `missing_s` and `missing_periods` median periods.
-    Bridged: at least `bridged_rows` successive rows whose consecutive slopes agree within `slope_tolerance`
-    (units per second) on every axis, while the signal is neither constant nor quantised there: each axis
-    must change from row to row. No honest inertial sensor moves along a straight line on all axes at once.
+    Bridged: at least `bridged_rows` successive rows that lie on one straight line of the k-dimensional signal space:
+    successive differences, each axis in units of its median step, are parallel within `straightness` rad, and every
+    axis moves from row to row (constant and quantised stretches do not count). No honest inertial sensor does that,
+    and the rule does not depend on the stamps, which may be jittered.
 
     Parameters
     ----------
@@ -128,13 +129,17 @@ def find_gaps(
     limit = max(missing_s, missing_periods * float(np.median(dt)))
     gaps = [Gap(int(t_ns[i]), int(t_ns[i + 1]), "missing") for i in np.flatnonzero(dt > limit)]
 
-    slope = np.diff(values, axis=0) / dt[:, None]
-    straight = (np.abs(np.diff(slope, axis=0)) < slope_tolerance).all(axis=1)
-    moving = (slope[1:] != 0.0).all(axis=1)
+    step = np.diff(values, axis=0)
+    unit = np.median(np.abs(step), axis=0)
+    step /= np.where(unit > 0, unit, 1.0)
+    length = np.sqrt(np.einsum("ij,ij->i", step, step))
+    cosine = np.einsum("ij,ij->i", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-300)
+    straight = cosine > np.cos(straightness)
+    moving = (step[1:] != 0.0).all(axis=1)
     padded = np.concatenate([[False], straight & moving, [False]])
     starts = np.flatnonzero(~padded[:-1] & padded[1:])
     ends = np.flatnonzero(padded[:-1] & ~padded[1:])
-    # k agreeing slope pairs span k + 2 rows
+    # k parallel pairs span k + 2 rows
     gaps += [
         Gap(int(t_ns[i]), int(t_ns[j + 1]), "bridged")
         for i, j in zip(starts, ends, strict=True)
