@@ -137,7 +137,8 @@ def used(session: Session, summary: Summary) -> str:
         why = '<p class="calm">The run did not record what was rejected or dropped.</p>'
     table = facts.used_table(summary, recorded).html()
     note = (
-        '<p class="fine">χ² / dof is the mean squared residual over its sigma: 1 means the stated noise is right.</p>'
+        '<p class="fine">χ² / dof: squared residuals over their sigmas, per redundant measurement; '
+        "1 means the stated noise is right.</p>"
     )
     return section("used", "What was used", table + why + note)
 
@@ -178,7 +179,11 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
     ]
     if not len(solution.residuals):
         return [*parts, section("residuals", "Residuals", '<p class="calm">The run recorded no residuals.</p>')]
-    both = charts.residual_histograms(solution) + charts.residuals_over_time(solution, gaps)
+    note = (
+        '<p class="fine">Residuals remain after the adjustment: where few measurements overlap they come out smaller '
+        "than the standard normal curve. χ² / dof above allows for that.</p>"
+    )
+    both = note + charts.residual_histograms(solution) + charts.residuals_over_time(solution, gaps)
     return [*parts, section("residuals", "Residuals", both)]
 
 

@@ -75,14 +75,13 @@ def draw(
     near = _near(path, fixes)
     x, y, aspect = _axes(np.concatenate([path, near]))
     plot = Plot(x, y, "Map of the trajectory, east and north in metres", "North [m]", "East [m]", aspect=aspect)
-    ellipses = _ellipses(plot, solution)
-    entries = _fixes(plot, fixes)
+    under = _ellipses(plot, solution) + _gaps(plot, solution, gaps)
+    entries = [("line way", "Smoothed path"), *_fixes(plot, fixes, ("used", "unused"))]
     if causal is not None and len(causal) > 1:
         _way(plot, causal.nav_t_body[:, :2], "line causal")
         entries.append(("line causal", "Estimate while replaying (causal)"))
     _way(plot, path, "line way")
-    entries = [("line way", "Smoothed path"), *entries]
-    entries += _gaps(plot, solution, gaps) + ellipses
+    entries += _fixes(plot, fixes, ("rejected",)) + under
     _ends(plot, path)
     _furniture(plot, path)
     widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
@@ -102,12 +101,14 @@ def _way(plot: Plot, xy: Floats, cls: str) -> None:
     plot.line(xy[keep, 0], xy[keep, 1], cls.removeprefix("line "), thin=False)
 
 
-def _fixes(plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) -> list[tuple[str, str]]:
+def _fixes(
+    plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]], states: Sequence[str]
+) -> list[tuple[str, str]]:
     names = {"gnss": "GNSS fix", "control": "Control point", "pose_fixes": "Pose fix"}
-    words = {"used": "used", "unused": "not used (withheld)", "rejected": "rejected"}
+    words = {"used": "used", "unused": "withheld or not used", "rejected": "rejected"}
     entries = []
     for name, (xy, state) in fixes.items():
-        for key, word in words.items():
+        for key in states:
             rows = xy[state == key]
             seen = (np.abs(plot.x.fraction(rows[:, 0]) - 0.5) <= 0.5) & (
                 np.abs(plot.y.fraction(rows[:, 1]) - 0.5) <= 0.5
@@ -116,7 +117,7 @@ def _fixes(plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) -> 
                 cls = f"{'control' if name != 'gnss' and key == 'used' else f'fix-{key}'}"
                 plot.dots(rows[seen, 0], rows[seen, 1], cls)
                 outside = f", {count((~seen).sum())} off the map" if (~seen).any() else ""
-                entries.append((f"dots {cls}", f"{names[name]} {word} ({count(len(rows))}{outside})"))
+                entries.append((f"dots {cls}", f"{names[name]} {words[key]} ({count(len(rows))}{outside})"))
     return entries
 
 
