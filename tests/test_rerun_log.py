@@ -237,6 +237,22 @@ def test_ellipsoids_along_the_path_are_magnified_by_a_round_factor_that_the_view
     assert f"Path (ENU), 3σ ellipsoids ×{factor[0, 0]:g}" in recording.view_names()
 
 
+def test_one_long_outage_does_not_bury_the_path_under_ellipsoids():
+    covariance = (
+        np.eye(3) * np.where(np.arange(100) < 95, 0.1, 100.0)[:, None, None] ** 2
+    )  # sigmas 0.1 m, five of 100 m
+    assert spatial.magnification(covariance, 1000.0) == 0.05
+    assert spatial.magnification(covariance[:95], 1000.0) == 10.0
+
+
+def test_legend_names_what_is_drawn_and_nothing_else(recording):
+    legend = recording.rows("/legend", "TextDocument:text", static=True)[0][0]
+    named = {line.split("]")[0][3:] for line in legend.splitlines() if line.startswith("* [")}
+    assert named < recording.paths
+    drawn = {path for path in recording.paths if path.startswith("/world/")} - {"/world/gnss/current"}
+    assert named == drawn
+
+
 def test_biases_and_errors_carry_their_variances(recording):
     solution = make_solution()
     np.testing.assert_array_equal(recording.values("/bias/accel", "Measurements:values"), solution.accel_bias)
@@ -307,7 +323,8 @@ def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
 def test_session_alone_shows_what_was_recorded(tmp_path):
     found = write(tmp_path / "s.rrd", solution=None, evaluation=None, summary=None, report_markdown=None)
     assert not [path for path in found.paths if path.startswith(("/world/est", "/bias", "/error", "/residuals"))]
-    assert set(found.view_names()) == {"Path (ENU)", "Map", "Accelerometer m/s²", "Gyroscope rad/s", "States", "Log"}
+    left, right = {"Path (ENU)", "Legend", "Map"}, {"Accelerometer m/s²", "Gyroscope rad/s", "States", "Log"}
+    assert set(found.view_names()) == left | right
     gap = found.texts("/status/imu", "StateChange:state")
     assert gap == ["recorded", "missing", "recorded"]  # found in the stream itself
 

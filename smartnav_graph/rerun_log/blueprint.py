@@ -96,6 +96,8 @@ def _scenes(recorder: Recorder, extent: Extent | None, factor: float) -> list[An
         views.append(_world(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
     if recorder.has("/report"):
         views.append(rrb.TextDocumentView(name="Report", origin="/report"))
+    if recorder.has("/legend"):
+        views.append(rrb.TextDocumentView(name="Legend", origin="/legend"))
     return views
 
 
@@ -214,7 +216,7 @@ def _residuals(solution: Solution | None) -> list[Any]:
         return []
     sensors = signals.sensors_of(solution.residuals)
     # Position sensors tell most: they stand first; the inertial residuals are many and small.
-    sensors.sort(key=lambda name: (name == "imu", name == "prior", name))
+    sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
         _series(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], legend=_few(solution, name)) for name in sensors
     ]

@@ -84,9 +84,12 @@ def ellipsoids(covariance: Floats) -> tuple[Floats, Floats]:
 
 
 def magnification(covariance: Floats, size: float) -> float:
-    """How many times larger the ellipsoids along the path are drawn: the large ones reach 1 % of the extent."""
-    large = np.sqrt(np.percentile(np.trace(covariance, axis1=1, axis2=2), 90)) * ELLIPSOID_SIGMAS
-    return nice(0.01 * size / large) if large > 0 else 1.0
+    """How many times larger the ellipsoids along the path are drawn, a round number.
+
+    The 90 % quantile of their size reaches 1 % of the extent, unless the largest would then exceed 5 %.
+    """
+    spread = ELLIPSOID_SIGMAS * np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    return nice(min(0.01 * size / float(np.percentile(spread, 90)), 0.05 * size / float(spread.max())))
 
 
 def thinned(points: Floats, most: int = MOST_PATH_POINTS) -> Floats:
@@ -210,8 +213,8 @@ def log_fixes(scene: Scene, events: Events) -> None:
     if session.gnss is not None:
         enu = session.nav_position(session.gnss)
         for name, use, colour, size in (
-            ("fixes", USED, colours.FIX, 2.5),
-            ("withheld", WITHHELD, colours.WITHHELD, 3.0),
+            ("fixes", USED, colours.FIX, 1.7),
+            ("withheld", WITHHELD, colours.WITHHELD, 2.0),
             ("rejected", REJECTED, colours.REJECTED, 4.5),
         ):
             scene.points(f"gnss/{name}", enu[events.fix_use == use], colour, size)

@@ -28,6 +28,21 @@ _STATES = {
     "rejected": BAD,
 }
 
+_LEGEND = {
+    "/world/est/path": "**blue line**, the smoothed path",
+    "/world/est/body": "**axes**, the body at the chosen time: x red, y green, z blue",
+    "/world/est/velocity": "**light green arrow**, the path of one second at the velocity of the chosen time",
+    "/world/est/covariance": "**orange, filled**, 3σ ellipsoid of the position at the chosen time, true size",
+    "/world/est/covariances": "**orange, wire**, 3σ ellipsoids along the path, magnified as the view's name says",
+    "/world/causal/path": "**yellow line**, the estimate when each keyframe became known",
+    "/world/reference/path": "**thin light line**, the reference",
+    "/world/gnss/fixes": "**green points**, GNSS fixes; large: the latest one",
+    "/world/gnss/withheld": "**violet points**, fixes that are not in the solution (withheld, or outside it)",
+    "/world/gnss/rejected": "**red points**, rejected fixes",
+    "/world/pose_fixes": "**cyan points**, position fixes from elsewhere",
+    "/world/control": "**pink points**, surveyed points",
+}
+
 Line = tuple[int, str, str]
 
 
@@ -82,8 +97,10 @@ def _opening(session: Session, events: Events, summary: Mapping[str, Any], told:
         lines += [
             (start, "WARN", f"{stream}: {count} rows dropped or repaired ({why})") for why, count in counts.items()
         ]
-    if summary.get("initialisation"):
-        lines.append((start, "INFO", f"initialised: {flat(summary['initialisation'])}"))
+    begun = summary.get("initialisation")
+    if begun:
+        sentence = begun.get("sentence") if isinstance(begun, Mapping) else None
+        lines.append((start, "INFO", f"initialised: {sentence or flat(begun)}"))
     lines += [(start, "WARN", str(text)) for text in summary.get("warnings", ())]
     return lines + [(start, "INFO", text) for text in told]
 
@@ -127,8 +144,12 @@ def _capped(lines: list[Line]) -> list[Line]:
 
 
 def log_report(recorder: Recorder, markdown: str | None) -> None:
-    """The report's text at /report."""
+    """The report's text at /report, and at /legend what the colours of the scene mean."""
     import rerun as rr
 
     if markdown:
         recorder.static("/report", rr.TextDocument(markdown, media_type="text/markdown"))
+    lines = [f"* [{path}](recording:/{path}): {text}" for path, text in _LEGEND.items() if recorder.has(path)]
+    if lines:
+        document = "# What is drawn\n\n" + "\n".join(lines) + "\n"
+        recorder.static("/legend", rr.TextDocument(document, media_type="text/markdown"))
