@@ -36,7 +36,7 @@ def write_recording(
     report_markdown: str | None = None,
     force: bool = True,
 ) -> None:
-    """Write an .rrd file for the Rerun viewer of the same version.
+    """Write an .rrd file for the Rerun viewer of this version (rerun-sdk 0.41) or the next.
 
     Parameters
     ----------

@@ -223,7 +223,7 @@ def _residuals(solution: Solution | None) -> list[Any]:
 
 
 def _few(solution: Solution, sensor: str) -> bool:
-    return int(solution.residuals.axis[solution.residuals.of(sensor)].max()) < 6
+    return int(solution.residuals.axis[solution.residuals.of(sensor)].max()) < 3
 
 
 def _series(
