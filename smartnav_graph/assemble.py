@@ -63,18 +63,17 @@ def to_solution(problem: Problem, estimate: Estimate, memory: Memory) -> Solutio
     return replace(solution, residuals=residuals(problem, estimate, memory))
 
 
-def causal_solution(problem: Problem, states: Sequence[tuple[State | None, Floats]]) -> Solution:
+def causal_solution(problem: Problem, states: Sequence[State]) -> Solution:
     """The estimate of each keyframe when it became known."""
-    known = [(state, covariance) for state, covariance in states if state is not None]
-    poses = np.array([state.nav.pose().matrix() for state, _ in known])
+    poses = np.array([state.nav.pose().matrix() for state in states])
     kinematics = Kinematics(
         poses[:, :3, :3],
         poses[:, :3, 3],
-        np.array([state.nav.velocity() for state, _ in known]),
-        np.array([state.bias.vector() for state, _ in known]),
+        np.array([state.nav.velocity() for state in states]),
+        np.array([state.bias.vector() for state in states]),
     )
-    t_ns = np.array([state.t_ns for state, _ in known], dtype=np.int64)
-    return _solution(problem, t_ns, kinematics, np.array([covariance for _, covariance in known]))
+    t_ns = np.array([state.t_ns for state in states], dtype=np.int64)
+    return _solution(problem, t_ns, kinematics, np.array([state.covariance for state in states]))
 
 
 def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals:
@@ -85,7 +84,7 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
         found = fix_residuals(builder, problem.windows, estimate, memory)
         used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
         white = found.residual / found.sigma
-        weight = np.where(used, _weights(builder, memory, white), 0.0)
+        weight = np.where(used, _weights(builder, white), 0.0)
         parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))
     native: dict[str, tuple[list[int], list[Floats]]] = {}
     for tag, factor in estimate.factors:
@@ -101,11 +100,11 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
     return _flat(parts)
 
 
-def _weights(builder: PositionBuilder, memory: Memory, white: Floats) -> Floats:
+def _weights(builder: PositionBuilder, white: Floats) -> Floats:
     """Robust weights (n,) of the loss in force."""
-    limit = {"huber": 1.345, "huber3": 3.0}.get(builder.loss(memory.phase))
-    norm = np.linalg.norm(white, axis=1)
-    return np.ones(len(white)) if limit is None else np.minimum(1.0, limit / np.maximum(norm, 1e-12))
+    if builder.config.loss != "huber":
+        return np.ones(len(white))
+    return np.asarray(np.minimum(1.0, 1.345 / np.maximum(np.linalg.norm(white, axis=1), 1e-12)))
 
 
 def _flat(parts: Sequence[tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]]) -> Residuals:

@@ -21,7 +21,7 @@ from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph import Builder, Memory, Window, build_step
+from smartnav_graph.graph import Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.problem import Problem, prepare
 from smartnav_graph.revise import revise
@@ -216,14 +216,17 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     smoother = Incremental(options, problem.session.t0_ns)
     builders = [initial.prior, *problem.builders]
     memory = replace(initial.memory, phase="causal", rejected={})
-    latency, states, interrupted = [], [], False
+    latency: list[float] = []
+    states: list[State] = []
+    interrupted = False
     total = len(problem.windows)
     try:
         for window in problem.windows:
             progress("replay", window.index, total)
             begin = time.perf_counter()
-            smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
-            states.append((smoother.latest(), smoother.covariance()))
+            previous = states[-1] if states else None
+            smoother.update(build_step(window, previous, builders, memory, problem.session.t0_ns))
+            states.append(smoother.known())
             latency.append(1e3 * (time.perf_counter() - begin))
     except KeyboardInterrupt:
         interrupted = True

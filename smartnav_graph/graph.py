@@ -46,12 +46,16 @@ def key(letter: str, index: int) -> int:
 
 @dataclass(frozen=True)
 class State:
-    """Estimate at one keyframe: `nav` (gtsam.NavState) and `bias` (gtsam.imuBias.ConstantBias)."""
+    """Estimate at one keyframe: `nav` (gtsam.NavState) and `bias` (gtsam.imuBias.ConstantBias).
+
+    covariance : (15, 15) as in `Solution`, where a smoother knows it while it runs
+    """
 
     index: int
     t_ns: int
     nav: Any
     bias: Any
+    covariance: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -89,13 +93,17 @@ class Tag:
 
 @dataclass
 class Step:
-    """What one window adds to the graph. `predicted` is the state at t1 that the inertial data foretell."""
+    """What one window adds to the graph.
+
+    predicted : state at t1 that the inertial data foretell; variance (3,) of its position m^2, where known
+    """
 
     index: int
     t_ns: int
     t_s: float
     predicted: Any = None
     bias: Any = None
+    variance: Floats | None = None
     factors: list[tuple[Tag, Any]] = field(default_factory=list)
     chain: dict[int, Any] = field(default_factory=dict)
 
@@ -121,7 +129,7 @@ class Memory:
     noise_scales : factor on the class-default sigma by group name
     rejected : rows not used, by sensor
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``gated`` (least squares
-    without them), ``causal`` (replay: a loss that is least squares up to three sigma)
+    without them), ``causal`` (replay: least squares, a redescending loss where a fix contradicts the prediction)
     """
 
     noise_scales: Mapping[str, float] = field(default_factory=dict)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -106,7 +107,7 @@ def find_rest(imu: Imu, start_ns: int, gravity: float, shortest_s: float, longes
     accel, gyro = imu.accel[first : first + len(t)], imu.gyro[first : first + len(t)]
     edges = np.searchsorted(t, np.arange(0.0, t[-1], 0.5))
     last = 0
-    for i, j in zip(edges[:-1], edges[1:], strict=True):
+    for i, j in pairwise(edges):
         if j - i < 3:
             break
         quiet = gyro[i:j].std(axis=0).max() < 0.01 and accel[i:j].std(axis=0).max() < 0.12

@@ -23,7 +23,6 @@ Floats = NDArray[np.float64]
 # No fix is believed better than this, metres: clocks and lever arms are not.
 LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
-ESTIMATED_TAIL = 4.0
 MEDIAN_CHI2_3 = float(chi2(3).median())
 
 
@@ -98,13 +97,7 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> 
 
 
 def _outside(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> frozenset[int]:
-    """Rows beyond the chi-square gate.
-
-    The gate widens with the robust level of all rows, so that optimistic sigmas reject nothing wholesale, and to
-    twice the sigma where the sigma was estimated: what tails the noise of such fixes has is part of it.
-    """
+    """Rows beyond the gate, at the robust level of all rows."""
     square = ((found.residual / builder.scaled_sigma(memory)[found.rows]) ** 2).sum(axis=1)
-    level = max(1.0, float(np.median(square)) / MEDIAN_CHI2_3)
-    limit = float(chi2(3).ppf(builder.config.gate_probability)) * level
-    limits = limit * np.where(builder.own_sigma[found.rows], 1.0, ESTIMATED_TAIL)
-    return frozenset(int(row) for row in found.rows[square > limits])
+    outside = builder.gate(square, float(np.median(square)) / MEDIAN_CHI2_3, found.rows)
+    return frozenset(int(row) for row in found.rows[outside])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError
@@ -15,6 +16,11 @@ from smartnav_graph.session import Session
 from smartnav_graph.streams import Positioned
 
 Floats = NDArray[np.float64]
+
+# Factor on the gate's square for fixes whose sigma was estimated.
+ESTIMATED_TAIL = 4.0
+# The same for a fix against its prediction: the clock and the noise are not settled yet, only gross faults count.
+CAUSAL_TAIL = 9.0
 
 
 @dataclass(frozen=True)
@@ -45,16 +51,12 @@ def fix_sigmas(stream: Positioned, default: GnssNoise) -> Floats:
 
 
 def noise_model(sigmas: Floats, loss: str) -> gtsam.noiseModel.Base:
-    """Diagonal noise under a loss applied to the whole fix: ``none``, ``huber``, ``cauchy`` or ``huber3``."""
+    """Diagonal noise under a loss applied to the whole fix: ``none``, ``huber`` or ``cauchy``."""
     model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     estimators = gtsam.noiseModel.mEstimator
     if loss == "none":
         return model
-    estimator = {
-        "huber": lambda: estimators.Huber.Create(1.345),
-        "huber3": lambda: estimators.Huber.Create(3.0),
-        "cauchy": lambda: estimators.Cauchy.Create(1.0),
-    }[loss]()
+    estimator = estimators.Huber.Create(1.345) if loss == "huber" else estimators.Cauchy.Create(1.0)
     return gtsam.noiseModel.Robust.Create(estimator, model)
 
 
@@ -78,7 +80,8 @@ class PositionBuilder:
         cls, session: Session, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig
     ) -> PositionBuilder:
         """Builder of a session's stream of positions."""
-        own = np.zeros(len(stream), bool) if stream.sigma is None else np.isfinite(stream.sigma).all(axis=1)
+        given = np.full((len(stream), 3), np.nan) if stream.sigma is None else stream.sigma
+        own = np.asarray(np.isfinite(given).all(axis=1))
         lever = np.asarray(session.mount(name).body_t, dtype=np.float64)
         return cls(name, session.nav_position(stream), fix_sigmas(stream, noise), own, lever, config)
 
@@ -86,25 +89,37 @@ class PositionBuilder:
         """Sigmas (n, 3) m after the noise scale of this sensor."""
         return np.where(self.own_sigma[:, None], self.sigma, self.sigma * memory.scale(self.name))
 
-    def loss(self, phase: str) -> str:
-        """Loss of a phase; see `Memory`."""
-        if self.config.loss == "gate":
-            return {"robust": "cauchy", "causal": "huber3"}.get(phase, "none")
-        return self.config.loss
+    def gate(self, square: Floats, level: float, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which rows, of normalised squares (m,), lie outside the chi-square gate.
+
+        `level` widens it with the robust level of all rows, so that optimistic sigmas reject nothing wholesale; rows
+        whose sigma was estimated get twice the sigma: what tails the noise of such fixes has is part of it.
+        """
+        limit = float(chi2(3).ppf(self.config.gate_probability)) * max(1.0, level)
+        return np.asarray(square > limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
+
+    def _loss_of(self, row: int, sigma: Floats, step: Step, memory: Memory) -> str:
+        """Loss of one fix in the phase at hand; see `Memory`."""
+        if self.config.loss != "gate":
+            return self.config.loss
+        if memory.phase != "causal" or step.variance is None:
+            return "cauchy" if memory.phase == "robust" else "none"
+        foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever
+        square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance)).sum()
+        return "cauchy" if self.gate(np.array([square]), CAUSAL_TAIL, np.array([row]))[0] else "none"
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """A factor for every row of this stream at the keyframe."""
         rows = window.rows.get(self.name, ())
         if len(rows) == 0:
             return
-        loss = self.loss(memory.phase)
         scale = memory.scale(self.name)
         pose = key("X", window.index)
         for row in rows:
             if memory.is_rejected(self.name, int(row)):
                 continue
             sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else scale)
-            model = noise_model(sigma, loss)
+            model = noise_model(sigma, self._loss_of(int(row), sigma, step, memory))
             tag = Tag(self.name, window.t1_ns, int(row))
             if self.lever.any():
                 step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever, model))

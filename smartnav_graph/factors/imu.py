@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -111,7 +112,7 @@ class ImuBuilder:
         start = next(gap.start_ns for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
         return self.bridges[start]
 
-    def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> object:
+    def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
         """GTSAM preintegrated measurements of one window, linearised at `bias`."""
         pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, memory), bias)
         integrate = pim.integrateMeasurement
@@ -129,14 +130,24 @@ class ImuBuilder:
             self._cache = cached
         return cached[1]
 
+    def _variance(self, pim: Any, length_s: float, previous: State, covariance: Floats) -> Floats:
+        """Variance (3,) m^2 of the predicted position: the state's before, carried over, and the window's own."""
+        nav_R_body = previous.nav.attitude().matrix()
+        own = np.diag(nav_R_body @ pim.preintMeasCov()[3:6, 3:6] @ nav_R_body.T)
+        before = np.diag(covariance)
+        tilt = (0.5 * self.gravity * length_s**2) ** 2 * before[:3].max()
+        return np.asarray(before[3:6] + length_s**2 * before[6:9] + tilt + own)
+
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
             return
         i, j = window.index - 1, window.index
         pim = self.preintegrate(window, previous.bias, memory)
-        step.predicted = pim.predict(previous.nav, previous.bias)  # type: ignore[attr-defined]
+        step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias
+        if previous.covariance is not None:
+            step.variance = self._variance(pim, window.length_s, previous, previous.covariance)
         tag = Tag("imu", window.t1_ns)
         step.add(tag, gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim))
         root = np.sqrt(window.length_s)

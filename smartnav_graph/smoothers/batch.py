@@ -28,10 +28,12 @@ from smartnav_graph.smoothers.estimate import (
 @dataclass(frozen=True)
 class BatchConfig:
     """settle_s : stretch after which the latest steps are solved by themselves, so that later windows start from an
-    anchored state; tolerance : relative decrease of the cost that ends the iteration."""
+    anchored state; tolerance, step_tolerance : relative decrease of the cost, and largest step in units of a
+    third of a radian, 100 m, 10 m/s, that end the iteration."""
 
     max_iterations: int = 50
     tolerance: float = 1e-7
+    step_tolerance: float = 1e-5
     settle_s: float = 30.0
 
     def __post_init__(self) -> None:
@@ -71,19 +73,22 @@ def minimise(graph: Any, values: Any, order: gtsam.Ordering, config: BatchConfig
     cost = graph.error(values)
     if not np.isfinite(cost):
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
+    trust = np.concatenate([_TRUST[chr(gtsam.symbolChr(name))] for name in list(values.keys())])
     damping, iterations, converged = 0.0, 0, False
     while iterations < config.max_iterations and not converged:
         iterations += 1
         linear = graph.linearize(values)
         while True:
-            candidate = values.retract(_step(linear, order, damping))
+            delta = _step(linear, order, damping)
+            candidate = values.retract(delta)
             new_cost = graph.error(candidate)
             if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-12:
                 break
             damping = max(10.0 * damping, 1e-2)
             if damping > 1e10:
                 return Solve(values, cost, iterations, _stationary(linear, order))
-        converged = damping <= 1.0 and cost - new_cost <= config.tolerance * max(new_cost, 1.0)
+        small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
+        converged = damping <= 1.0 and small and cost - new_cost <= config.tolerance * max(new_cost, 1.0)
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
     return Solve(values, cost, iterations, converged)
 
@@ -162,7 +167,7 @@ class Batch:
             graph.push_back(self._anchor)
         order = elimination_order(indices)
         try:
-            solve = minimise(graph, values, order, BatchConfig(max_iterations=40, tolerance=1e-3))
+            solve = minimise(graph, values, order, BatchConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0))
             tree = graph.linearize(solve.values).eliminateMultifrontal(order, gtsam.EliminateQR)
             self._anchor = _anchor(tree, solve.values, indices[-1])
         except (RuntimeError, SolverError):

@@ -6,7 +6,7 @@ QR factorisation, because Cholesky gives up on yaw that is only weakly known (Ka
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -22,26 +22,38 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """smoother : fixed-lag or isam2; lag_s; relinearize_threshold : step size that moves a linearisation point;
+    """smoother : fixed-lag or isam2; lag_s; relinearize : factor on the step sizes that move a linearisation point;
     polish : solve everything once more at the end."""
 
     smoother: str = "fixed-lag"
     lag_s: float = 10.0
-    relinearize_threshold: float = 0.1
+    relinearize: float = 1.0
     polish: bool = True
 
     def __post_init__(self) -> None:
         if self.smoother not in ("fixed-lag", "isam2"):
             raise ConfigError("--smoother", f"{self.smoother!r}", "fixed-lag or isam2")
-        if not (self.lag_s > 0 and self.relinearize_threshold > 0):
+        if not (self.lag_s > 0 and self.relinearize > 0):
             raise ConfigError("config [replay]", f"lag_s = {self.lag_s}", "> 0 s")
 
 
-def isam2_params(threshold: float) -> gtsam.ISAM2Params:
+# Steps that move a linearisation point: only rotation and bias make the factors nonlinear.
+_THRESHOLDS = {
+    "X": np.array([0.005] * 3 + [0.1] * 3),
+    "V": np.full(3, 0.1),
+    "B": np.array([0.01] * 3 + [0.001] * 3),
+    "C": np.full(3, 1.0),
+}
+
+
+def isam2_params(factor: float) -> gtsam.ISAM2Params:
     """iSAM2 with QR and relinearisation at every step that needs it."""
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for letter, size in _THRESHOLDS.items():
+        thresholds.insert((letter, factor * size))
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
-    params.setRelinearizeThreshold(threshold)
+    params.setRelinearizeThreshold(thresholds)
     params.relinearizeSkip = 1
     return params
 
@@ -51,7 +63,7 @@ class Incremental:
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         self.config, self.t0_ns = config, t0_ns
-        params = isam2_params(config.relinearize_threshold)
+        params = isam2_params(config.relinearize)
         self._fixed_lag = config.smoother == "fixed-lag"
         self._engine: Any = (
             gtsam.IncrementalFixedLagSmoother(config.lag_s, params) if self._fixed_lag else gtsam.ISAM2(params)
@@ -102,7 +114,11 @@ class Incremental:
         while self._fixed_lag and self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
             _insert(self._left, self._state(self._inside.popleft()))
 
-    def covariance(self) -> Floats:
+    def known(self) -> State:
+        """State of the latest keyframe with its covariance."""
+        return replace(self._state(self.steps[-1]), covariance=self._covariance())
+
+    def _covariance(self) -> Floats:
         """(15, 15) of the latest keyframe, nav axes; blocks of pose, velocity and bias."""
         i = self.steps[-1].index
         joint = np.zeros((1, 15, 15))
