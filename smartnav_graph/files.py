@@ -55,3 +55,15 @@ def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def refuse_foreign(path: str | Path, mark: str) -> None:
+    """Raise where `path` is a folder with something in it, but not the `mark` file of the kind to be replaced.
+
+    Keeps a mistyped ``--out`` with ``--force`` from replacing a folder of somebody's own.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or (path / mark).is_file())):
+        raise SessionError(
+            path, f"holds no {mark}, so it is not replaced", f"a new name or a folder with {mark}", "remove it yourself"
+        )

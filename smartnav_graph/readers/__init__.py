@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from smartnav_graph import session
 from smartnav_graph.errors import SessionError
 from smartnav_graph.readers import comma2k19, csv_folder, euroc, gtsam_euroc, gtsam_kitti
 from smartnav_graph.readers.archive import is_archive, unpacked
@@ -25,7 +26,25 @@ READERS: dict[str, Reader] = {
     )
 }
 
-__all__ = ["READERS", "Reader", "find", "read"]
+__all__ = ["READERS", "Reader", "find", "load", "read"]
+
+
+def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
+    """A session folder, or a log of a known format read in memory.
+
+    Parameters
+    ----------
+    source : session folder, or anything `read` takes
+    repairs : names of `smartnav_graph.repair` to apply beside those that session.toml asks for
+
+    Raises
+    ------
+    SessionError
+        It is neither, or a file in it is missing, unreadable or faulty.
+    """
+    folder = Path(source)
+    ours = (folder / "session.toml").is_file() and not any(folder.glob("*.csv"))
+    return session.load(folder, repairs=repairs) if ours else read(source, repairs=repairs)
 
 
 def find(source: str | Path, name: str | None = None) -> Reader:

@@ -1,0 +1,76 @@
+"""The first command: two recordings that come with gtsam, from the log to the picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from smartnav_graph import readers
+from smartnav_graph import session as session_model
+from smartnav_graph.cli.options import Command, OutPath, progress
+from smartnav_graph.cli.text import print_findings, run_text, withheld_lines
+from smartnav_graph.config import Config, RunConfig
+from smartnav_graph.errors import SessionError
+from smartnav_graph.session import Session
+
+MARK = ".smartnav-demo"
+KEPT = "gnss:every=10"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Command):
+    """Smooth and evaluate the KITTI drive that comes with gtsam, write its report and recording, and show the EuRoC
+    half minute; needs no data of your own. May be run again: it replaces what it wrote.
+
+    Example: smartnav demo --out demo
+    """
+
+    out: OutPath = Path("demo")
+    """Folder for everything."""
+
+    def run(self) -> None:
+        claim(self.out)
+        session = save(readers.read("gtsam-kitti"), self.out / "kitti")
+        print(f"KITTI drive: {len(session.require_imu())} inertial samples")
+        self._smooth(session, Config(), self.out / "kitti-run")
+        print(f"\nThe same with one fix in ten ({KEPT}); the other nine are only scored:")
+        kept = replace(Config(), run=RunConfig(withhold=(KEPT,)))
+        self._smooth(session, kept, self.out / "kitti-withheld", brief=True)
+        self._show_euroc()
+        print(f"\nopen {self.out / 'kitti-run' / 'report.html'} in a browser")
+        print(f"see  smartnav view {self.out / 'kitti-run'} [--web]")
+        print(f"see  smartnav view {self.out / 'euroc'} [--web]")
+
+    def _smooth(self, session: Session, config: Config, out: Path, *, brief: bool = False) -> None:
+        from smartnav_graph import estimate
+        from smartnav_graph.run_folder import write_run
+
+        with progress(self.quiet) as show:
+            run = estimate.smooth(session, config, progress=show)
+        summary = write_run(run, out, force=True)
+        print_findings("\n".join(withheld_lines(summary)) if brief else run_text(summary, out))
+
+    def _show_euroc(self) -> None:
+        from smartnav_graph.rerun_log import write_recording
+
+        session = save(readers.read("gtsam-euroc"), self.out / "euroc")
+        write_recording(self.out / "euroc.rrd", session=session, solution=None, force=True)
+        streams = ", ".join(f"{name} {len(stream)}" for name, stream in session.streams().items())
+        print(f"\nEuRoC half minute: {streams}; imported and drawn (not smoothed yet: it has no positions)")
+
+
+def claim(out: Path) -> None:
+    """Make the folder, or take one that an earlier demo made."""
+    if out.exists() and not (out / MARK).is_file() and not (out.is_dir() and not any(out.iterdir())):
+        raise SessionError(out, "exists already and is no demo", "a new name", "choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / MARK).write_text("written by smartnav demo, which may replace what stands here\n", encoding="utf-8")
+    except OSError as error:
+        raise SessionError(out, f"cannot be written ({error.strerror})", "a writable place") from error
+
+
+def save(session: Session, path: Path) -> Session:
+    """Write a session folder over an older one."""
+    session_model.save(session, path, force=True)
+    return session.replace(path=path)

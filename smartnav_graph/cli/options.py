@@ -1,0 +1,170 @@
+"""What commands have in common: options, the configuration file under the flags, progress."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import tyro
+
+from smartnav_graph import config as config_model
+from smartnav_graph import repair as repair_model
+from smartnav_graph.config import Config
+
+Switch = tyro.conf.FlagCreatePairsOff[bool]
+Text = str | None
+SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SESSION")]
+OutPath = Annotated[Path, tyro.conf.arg(metavar="PATH")]
+Repairs = Annotated[Text, tyro.conf.arg(name="repair", metavar="A,B")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A sub-command: its fields are its options, its docstring its help."""
+
+    quiet: Switch = False
+    """No progress."""
+    debug: Switch = False
+    """Show the traceback of an error."""
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> Self | None:
+        """Defaults that depend on the arguments themselves; None takes those of the class."""
+        return None
+
+    def run(self) -> None:
+        """Do it."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Writing(Command):
+    """A command that writes to a place."""
+
+    out: OutPath
+    """Where to write."""
+    force: Switch = False
+    """Replace what the command wrote there before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimating(Writing):
+    """What `smooth` and `replay` have in common."""
+
+    session: SourceName
+    """Session folder, or a log of a known format (see `smartnav formats`)."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """config.toml; the options below go over it."""
+    vehicle: Literal["none", "car", "trolley", "foot"] | None = None
+    """What carries the device, where the session does not say."""
+    sensors: Annotated[Text, tyro.conf.arg(metavar="A,B,-C")] = None
+    """Streams to use, or with a minus to leave out."""
+    withhold: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
+    """Rows to keep back and score: gnss:every=10 keeps each tenth fix, gnss:outage=100-130 drops 30 s; repeatable."""
+    start: Annotated[float | None, tyro.conf.arg(name="from", metavar="S")] = None
+    """Begin here, seconds from the session's start."""
+    end: Annotated[float | None, tyro.conf.arg(name="to", metavar="S")] = None
+    """End here, seconds from the session's start."""
+    initial: Annotated[Text, tyro.conf.arg(metavar="E,N,U,HEADING_DEG[,SIGMA_M,SIGMA_DEG]")] = None
+    """Where the start is, instead of finding it."""
+    rate: Annotated[Text, tyro.conf.arg(metavar="keyframes|imu|HZ")] = None
+    """Rate of the trajectory."""
+    repair: Repairs = None
+    """Repairs of faulty rows: nan, order, stamps."""
+    options: Annotated[tyro.conf.FlagConversionOff[Config], tyro.conf.arg(name="")] = field(default_factory=Config)
+
+    @classmethod
+    def defaults(cls, arguments: Sequence[str]) -> Self | None:
+        """The configuration file, where one is named."""
+        file = _value_of("--config", arguments)
+        if file is None:
+            return None
+        missing: Any = tyro.MISSING
+        return cls(session=missing, out=missing, options=config_model.load(file))
+
+    def resolved(self) -> Config:
+        """The configuration with the options over it."""
+        asked = given(
+            vehicle=self.vehicle,
+            sensors=None if self.sensors is None else names(self.sensors),
+            withhold=self.withhold or None,
+            start_s=self.start,
+            end_s=self.end,
+            initial=self.initial,
+            rate=self.rate,
+        )
+        return dataclasses.replace(self.options, run=dataclasses.replace(self.options.run, **asked))
+
+
+def given(**options: Any) -> dict[str, Any]:
+    """The options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def names(text: str | None) -> tuple[str, ...]:
+    """The names of a comma separated list."""
+    return tuple(part.strip() for part in (text or "").split(",") if part.strip())
+
+
+def repairs(text: str | None) -> tuple[str, ...]:
+    """The repairs of a comma separated list, checked."""
+    return repair_model.check_names(names(text))
+
+
+def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
+    """The command with its options; raises SystemExit for help (0) and wrong usage (2)."""
+    joined = join_values(arguments)
+    default: Any = kind.defaults(joined)
+    return tyro.cli(kind, prog=f"smartnav {name}", description=inspect.getdoc(kind), args=joined, default=default)
+
+
+def join_values(arguments: Sequence[str]) -> list[str]:
+    """``--option -value`` as ``--option=-value``, and true, false, none of the configuration as Python spells them.
+
+    No option has a short name but -h, so that a single leading minus after an option belongs to its value.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        before = joined[-1] if joined else ""
+        opened = before.startswith("--") and "=" not in before
+        if opened and argument.startswith("-") and not argument.startswith("--") and argument != "-h":
+            joined[-1] = f"{before}={argument}"
+        elif opened and "." in before and argument.lower() in ("true", "false", "none"):
+            joined.append(argument.capitalize())
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _value_of(option: str, arguments: Sequence[str]) -> str | None:
+    """The last value of an option that takes one."""
+    found = None
+    for i, argument in enumerate(arguments):
+        if argument == option and i + 1 < len(arguments):
+            found = arguments[i + 1]
+        elif argument.startswith(f"{option}="):
+            found = argument.partition("=")[2]
+    return found
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr: gives a function of stage, done, total. Nothing where nobody watches."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield show

@@ -1,0 +1,109 @@
+"""Commands that make a run, and that give it to other programs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from smartnav_graph import readers
+from smartnav_graph.cli.options import Estimating, Writing, given, progress, repairs
+from smartnav_graph.cli.text import print_findings, run_text
+from smartnav_graph.config import Config
+from smartnav_graph.errors import SmartnavError
+from smartnav_graph.evaluation import Evaluation
+from smartnav_graph.run_folder import check_out, read_run, write_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smooth(Estimating):
+    """A session -> a run: the smoothed trajectory with its covariance, residuals, report and recording.
+
+    Example: smartnav smooth kitti --out kitti-run --withhold gnss:every=10
+    """
+
+    def run(self) -> None:
+        estimate_to_folder(self, self.resolved(), causal=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Estimating):
+    """One window at a time, causal; the final smoothed solution and the estimate of each moment are both written.
+
+    Ctrl-C ends the replay and writes what is done.
+
+    Example: smartnav replay kitti --out kitti-replay --smoother fixed-lag --lag 10
+    """
+
+    smoother: Literal["fixed-lag", "isam2"] | None = None
+    """The smoother."""
+    lag: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
+    """Seconds that the fixed-lag smoother keeps."""
+
+    def resolved(self) -> Config:
+        """With the smoother and its lag."""
+        config = super().resolved()
+        return replace(config, replay=replace(config.replay, **given(smoother=self.smoother, lag_s=self.lag)))
+
+    def run(self) -> None:
+        estimate_to_folder(self, self.resolved(), causal=True)
+
+
+def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> None:
+    """Load, estimate, write, tell."""
+    from smartnav_graph import estimate
+
+    check_out(command.out, command.force)
+    begin = time.perf_counter()
+    session = readers.load(command.session, repairs=repairs(command.repair))
+    load_s = time.perf_counter() - begin
+    with progress(command.quiet) as show:
+        run = (estimate.replay if causal else estimate.smooth)(session, config, progress=show)
+    evaluation = against_own_reference(run)
+    summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s)
+    if "interrupted" in summary["mode"] and not command.quiet:
+        print("smartnav: interrupted; what was done until then is written", file=sys.stderr)
+    print_findings(run_text(summary, command.out))
+
+
+def against_own_reference(run: object) -> Evaluation | None:
+    """The comparison with the session's own reference, where it has one on the same clock."""
+    from smartnav_graph.estimate import Run
+    from smartnav_graph.evaluation import evaluate
+
+    assert isinstance(run, Run)
+    if run.session.reference is None:
+        return None
+    try:
+        # a start that was not measured absolutely cannot agree in place and heading
+        align = "yaw" if "dead-reckoning" in run.summary["mode"] else "none"
+        return evaluate(run.solution, run.session.reference, align=align, reference_name="reference.parquet")
+    except SmartnavError as error:
+        print(f"smartnav: not compared with the session's reference: {error}", file=sys.stderr)
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Writing):
+    """A run as one file for other programs.
+
+    Example: smartnav export kitti-run --format tum --out kitti.tum
+    """
+
+    run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
+    """Run folder."""
+    format: Literal["tum", "kml", "geojson", "gpx", "csv"]
+    """The format; kml, geojson and gpx need an origin."""
+    solution: Literal["smoothed", "causal"] = "smoothed"
+    """Which of a replay's two."""
+
+    def run(self) -> None:
+        from smartnav_graph.export import export
+
+        run = read_run(self.run_path)
+        export(run.named(self.solution), self.format, self.out, force=self.force, clock_epoch=run.clock_epoch)
+        print(f"{self.format}: {self.out}")

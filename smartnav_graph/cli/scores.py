@@ -1,0 +1,114 @@
+"""Commands that say how good a run is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from smartnav_graph.cli.options import Command, Switch
+from smartnav_graph.cli.text import statistics_line
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.evaluation import Evaluation, evaluate
+from smartnav_graph.readers.reference import load_reference
+from smartnav_graph.run_folder import plain, read_run
+
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Command):
+    """A run against a reference: absolute and relative errors, percentiles, consistency (NEES).
+
+    Example: smartnav evaluate walk-run --reference walk --align yaw --json
+    """
+
+    run_path: RunPath
+    """Run folder."""
+    reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """TUM, EuRoC ground truth, KITTI poses, CSV with t, x, y, z named, or a session folder."""
+    times: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Times of KITTI poses."""
+    body_T_ref: Annotated[Path | None, tyro.conf.arg(name="body-T-ref", metavar="FILE")] = None
+    """TOML with the pose of the reference's frame in the body, a 4x4 matrix body_T_<name>."""
+    align: Literal["none", "yaw", "se3", "sim3"] = "none"
+    """What to fit to the reference before comparing."""
+    solution: Literal["smoothed", "causal"] = "smoothed"
+    """Which of a replay's two."""
+    time_offset: Annotated[str, tyro.conf.arg(metavar="S|auto")] = "0"
+    """Added to the stamps of the reference; auto finds it."""
+    json: Switch = False
+    """Print JSON, and nothing else, on stdout."""
+
+    def run(self) -> None:
+        found = evaluate(
+            read_run(self.run_path).named(self.solution),
+            load_reference(self.reference, times=self.times, body_T_ref=self.body_T_ref),
+            align=self.align,
+            time_offset_s=_offset(self.time_offset),
+            solution_name=self.solution,
+            reference_name=str(self.reference),
+        )
+        print(json.dumps(plain(found.to_dict()), allow_nan=False) if self.json else evaluation_text(found))
+
+
+def _offset(text: str) -> Any:
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError as error:
+        raise ConfigError("--time-offset", repr(text), "seconds, or auto") from error
+
+
+def evaluation_text(found: Evaluation) -> str:
+    """The figures of an evaluation for people."""
+    told = found.to_dict()
+    lines = [
+        f"{found.solution} against {found.reference}: {found.matched} epochs matched, {found.unmatched} outside; "
+        f"alignment {found.align}, time offset {found.time_offset_s:.4f} s",
+        statistics_line("position", "m", told["ape_m"]),
+        statistics_line("rotation", "deg", told["rotation_deg"]),
+    ]
+    for row in found.rpe:
+        if row.translation_m is not None:
+            turn = "" if row.rotation_deg is None else f", {row.rotation_deg:.3f} deg"
+            lines.append(f"over {row.delta_s:g} s{'':<4}{row.translation_m:.3f} m{turn} ({row.pairs} pairs)")
+    told_nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
+    lines += [f"NEES        {told_nees} (expected 3; yaw 1)"] if told_nees else []
+    return "\n".join([*lines, *found.notes])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(Command):
+    """A run against another: how far apart they are, how their sigmas differ, and what was asked of each.
+
+    Example: smartnav compare kitti-run kitti-replay
+    """
+
+    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN1")]
+    """Run folder."""
+    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN2")]
+    """Run folder."""
+    json: Switch = False
+    """Print JSON, and nothing else, on stdout."""
+
+    def run(self) -> None:
+        from smartnav_graph.evaluation.compare import compare
+        from smartnav_graph.run_folder import config_differences
+
+        found = compare(read_run(self.first).solution, read_run(self.second).solution)
+        options = config_differences(self.first, self.second)
+        if self.json:
+            print(json.dumps(plain({**found.to_dict(), "config": options}), allow_nan=False))
+            return
+        print(f"{found.epochs} common epochs of {self.first} and {self.second}")
+        for name, unit in (("position", "m"), ("rotation", "deg"), ("velocity", "m/s")):
+            print(statistics_line(name, unit, found.to_dict()[f"{name}_{unit.replace('/', '_')}"]))
+        print(
+            f"sigma       median ratio second / first: position {found.sigma_ratio['position']:.3f}, "
+            f"rotation {found.sigma_ratio['rotation']:.3f}, velocity {found.sigma_ratio['velocity']:.3f}"
+        )
+        for key, (one, other) in options.items():
+            print(f"config      {key}: {one} | {other}")
