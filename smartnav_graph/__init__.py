@@ -1,1 +1,140 @@
-"""smartnav_graph: a recorded phone or MEMS session in, a smoothed trajectory with honest covariance out."""
+"""smartnav_graph: a recorded phone or MEMS session in, a smoothed trajectory with honest covariance out.
+
+    import smartnav_graph as sn
+
+    solution = sn.smooth(sn.load("kitti"))       # a session folder, or a log: sn.load("gtsam-kitti")
+    solution.to_pandas()[["e_m", "n_m", "heading_deg", "sigma_heading_deg"]]
+
+    run = sn.run(sn.load("kitti"), withhold=("gnss:every=10",))
+    run.summary["withheld"]
+    sn.write_run(run, "kitti-run")               # trajectory.csv, report.html, run.rrd ...
+
+Conventions
+-----------
+**Frames.** *nav* is the local tangent plane, x east, y north, z up (ENU), at the session's origin (WGS84 latitude and
+longitude in degrees, ellipsoidal height in metres); a session without origin is metric and local. *body* is the IMU's
+own axes, never turned: a phone has x right, y top, z out of the screen. Which body axis points forward and up stands in
+the session (``device.forward``, ``device.up``; a phone lying flat ``+y``, ``+z``) and serves heading, pitch and roll.
+*cam* is OpenCV's optical frame: x right, y down, z forward.
+
+**Names.** ``a_X_b`` is X of b expressed in a, so that neighbouring indices cancel: ``nav_T_cam = nav_T_body *
+body_T_cam``; ``nav_R_body`` turns body coordinates into nav, ``body_t_antenna`` is a lever arm in body axes.
+
+**Accelerometers** measure specific force: at rest +9.81 m/s^2 on the axis that points up. Gravity is normal gravity at
+the origin where there is one, unless the session gives its own value.
+
+**Time** is ``t_ns``, int64 nanoseconds of the source's own clock, one clock a session; seconds in options, reports and
+`Solution.seconds` count from time zero, the first inertial sample.
+
+**Units** are SI and radians; a suffix tells where not (``_deg``, ``_ns``, ``_hpa``, ``_ut``, ``_px``). Noise densities
+are in unit/sqrt(Hz), random walks in unit*sqrt(Hz) per second.
+
+**Angles for people.** Heading is clockwise from north, pitch positive with the forward axis up, roll positive with the
+right side down; degrees.
+
+**Covariance** is 15 x 15 in the order rotation, position, velocity (nav axes), accelerometer bias, gyroscope bias (body
+axes). The rotation error is the nav vector theta of ``R_true = Exp(theta) R``: its third component is the error about
+the vertical, whatever the attitude.
+
+**Errors** of input and solver are `SmartnavError` and read
+``<where>: <what was found>; expected <rule>; <what to do>``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from smartnav_graph.calibration.model import Calibration as Calibration
+    from smartnav_graph.config import Config as Config
+    from smartnav_graph.errors import SmartnavError as SmartnavError
+    from smartnav_graph.estimate import Run as Run
+    from smartnav_graph.evaluation import evaluate as evaluate
+    from smartnav_graph.readers import load as load
+    from smartnav_graph.readers.reference import load_reference as load_reference
+    from smartnav_graph.run_folder import read_run as read_run
+    from smartnav_graph.run_folder import write_run as write_run
+    from smartnav_graph.session import Session as Session
+    from smartnav_graph.session import save as save
+    from smartnav_graph.simulation.scenarios import simulate as simulate
+    from smartnav_graph.solution import Solution as Solution
+
+# name -> module that holds it; imported when first asked for, so that the door itself costs nothing
+_ROOMS = {
+    "Calibration": "calibration.model",
+    "Config": "config",
+    "Run": "estimate",
+    "Session": "session",
+    "SmartnavError": "errors",
+    "Solution": "solution",
+    "evaluate": "evaluation",
+    "load": "readers",
+    "load_reference": "readers.reference",
+    "read_run": "run_folder",
+    "save": "session",
+    "simulate": "simulation.scenarios",
+    "write_run": "run_folder",
+}
+
+__all__ = [
+    *_ROOMS,
+    "replay",
+    "run",
+    "smooth",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOMS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_ROOMS[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+def smooth(session: Session, config: Config | None = None, **options: Any) -> Solution:
+    """The smoothed solution of a recorded session: every state with its covariance from all data.
+
+    Parameters
+    ----------
+    session : of `load` or `simulate`
+    config : all options; the defaults suit phones and MEMS loggers
+    options : fields of `smartnav_graph.config.RunConfig` over it: vehicle, sensors, withhold, start_s, end_s, initial,
+        rate, passes
+
+    Raises
+    ------
+    SmartnavError
+        Bad input, or a problem that cannot be solved; the message says what to do.
+    """
+    return run(session, config, **options).solution
+
+
+def replay(session: Session, config: Config | None = None, **options: Any) -> Solution:
+    """The causal solution: every keyframe as it was known when its data had come in. Otherwise as `smooth`."""
+    causal = run(session, config, causal=True, **options).causal
+    assert causal is not None  # a replay gives one
+    return causal
+
+
+def run(session: Session, config: Config | None = None, *, causal: bool = False, **options: Any) -> Run:
+    """Everything one run gives: solution, summary, withheld rows scored, and of a replay (`causal`) both solutions.
+
+    Parameters and errors as `smooth`.
+    """
+    import dataclasses
+
+    from smartnav_graph import estimate
+    from smartnav_graph.config import Config, RunConfig
+    from smartnav_graph.errors import ConfigError
+
+    known = [field.name for field in dataclasses.fields(RunConfig)]
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise ConfigError("smooth", f"unknown option {', '.join(unknown)}", f"some of {', '.join(known)}")
+    config = config or Config()
+    config = dataclasses.replace(config, run=dataclasses.replace(config.run, **options))
+    return (estimate.replay if causal else estimate.smooth)(session, config)

@@ -31,6 +31,7 @@ from smartnav_graph.session import write_table
 from smartnav_graph.solution import Residuals, Solution
 
 SUMMARY = "summary.json"
+UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ def _write_views(
     common |= {"evaluation": evaluation, "causal": run.causal}
     if recording:
         # a summary without its timings: equal runs give equal recordings
-        steady = {key: value for key, value in told.items() if key not in ("timings_s", "peak_memory_mb", "update_ms")}
+        steady = {key: value for key, value in told.items() if key not in UNSTEADY}
         write_recording(folder / "run.rrd", report_markdown=report_markdown(steady, evaluation), **common)
     if report:
         write_report(folder / "report.html", withheld=run.withheld, **common)

@@ -10,9 +10,12 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
-from smartnav_graph.cli.options import Command, parse
 from smartnav_graph.errors import SmartnavError
+
+if TYPE_CHECKING:
+    from smartnav_graph.cli.options import Command
 
 # name -> module, class, one line. Modules are imported when their command is called.
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -70,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, rest: list[str]) -> int:
+    from smartnav_graph.cli.options import parse
+
     try:
         command = parse(command_class(name), name, rest)
         logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")

@@ -120,7 +120,9 @@ def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
     """The command with its options; raises SystemExit for help (0) and wrong usage (2)."""
     joined = join_values(arguments)
     default: Any = kind.defaults(joined)
-    return tyro.cli(kind, prog=f"smartnav {name}", description=inspect.getdoc(kind), args=joined, default=default)
+    text = inspect.getdoc(kind)
+    found: Command = tyro.cli(kind, prog=f"smartnav {name}", description=text, args=joined, default=default)
+    return found
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:
