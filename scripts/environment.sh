@@ -31,6 +31,6 @@ prepare_environment() {
     if [ "$(cat .venv/installed-test 2>/dev/null || true)" = "$stamp" ]; then return; fi
     if [ -z "$extras" ] && [ "$(cat .venv/installed 2>/dev/null || true)" = "$stamp" ]; then return; fi
     echo "Installing packages into .venv (some minutes the first time)" >&2
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$extras"
+    .venv/bin/python -m pip install --quiet --use-pep517 --disable-pip-version-check -c constraints.txt -e ".$extras"
     if [ -n "$extras" ]; then echo "$stamp" > .venv/installed-test; else echo "$stamp" > .venv/installed; fi
 }

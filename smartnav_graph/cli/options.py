@@ -126,7 +126,7 @@ def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:
-    """``--option -value`` as ``--option=-value``, and true, false, none of the configuration as Python spells them.
+    """``--option -value`` as ``--option=-value``, and true, false of the configuration as Python spells them.
 
     No option has a short name but -h, so that a single leading minus after an option belongs to its value.
     """
@@ -136,7 +136,7 @@ def join_values(arguments: Sequence[str]) -> list[str]:
         opened = before.startswith("--") and "=" not in before
         if opened and argument.startswith("-") and not argument.startswith("--") and argument != "-h":
             joined[-1] = f"{before}={argument}"
-        elif opened and "." in before and argument.lower() in ("true", "false", "none"):
+        elif opened and "." in before and argument.lower() in ("true", "false"):
             joined.append(argument.capitalize())
         else:
             joined.append(argument)
