@@ -15,7 +15,8 @@ from smartnav_graph.cli import COMMANDS, command_class, demo, main
 from smartnav_graph.cli.options import Estimating, join_values, parse
 from smartnav_graph.run_folder import read_run
 
-FAST = ("--to", "20", "--initial", "0,0,0,0,3,30", "--quiet")
+START = "--initial 0,0,0,0,3,30"
+FAST = ("--to", "20", *START.split(), "--quiet")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,172 @@
+"""Benchmarks, each beside its baseline in the same run: CPU seconds after imports, a fresh process a measurement.
+
+    scripts/benchmark [--only NAME] [--repeat 5] [--json FILE]
+
+batch-37min       simulated drive of 37 min in memory -> solution with 15x15 covariances, noise self-calibration off;
+                  baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
+batch-37min-full  the same with everything on: fixes without sigmas; baseline as above
+batch-2h          two hours, as batch-37min; baseline: batch-37min
+replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive that comes with gtsam, lag 10 s;
+                  baseline: scripts/bare_fixed_lag.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+MINUTES = 37
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One measurement of a fresh process."""
+
+    seconds: float
+    peak_memory_mb: float | None
+    detail: dict[str, Any]
+
+
+def python(*arguments: str) -> dict[str, Any]:
+    """The last line of a fresh Python's output, as JSON."""
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"benchmark: {' '.join(arguments)} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def bare(factor: str) -> Measured:
+    told = python(str(HERE / "bare_gtsam.py"), str(MINUTES), factor)
+    return Measured(told["total_s"], None, {key: told[key] for key in ("cpu_s", "iterations")})
+
+
+def bare_fixed_lag() -> Measured:
+    told = python(str(HERE / "bare_fixed_lag.py"), "gtsam-kitti", "10")
+    return Measured(told["p99"] / 1e3, None, told)
+
+
+def ours(kind: str, session: str) -> Measured:
+    told = python(str(HERE / "benchmark.py"), "--measure", kind, session)
+    return Measured(told["seconds"], told["peak_memory_mb"], told["detail"])
+
+
+def measure(kind: str, path: str) -> None:
+    """In the fresh process: one run of a session in memory, told as a JSON line."""
+    import smartnav_graph as sn
+    from smartnav_graph import estimate  # imports are not measured
+
+    session, config = sn.load(path), sn.Config()
+    if kind == "batch":
+        config = replace(config, gnss=replace(config.gnss, estimate_sigma=False))
+    if kind == "replay":
+        config = replace(config, replay=replace(config.replay, smoother="fixed-lag", lag_s=10.0, polish=False))
+    begin = time.process_time()
+    run = (estimate.replay if kind == "replay" else estimate.smooth)(session, config)
+    seconds = time.process_time() - begin
+    assert run.solution.covariance.shape == (len(run.solution), 15, 15)
+    keys = ("keyframes", "iterations", "passes", "converged", "timings_s", "update_ms")
+    detail = {key: run.summary[key] for key in keys if key in run.summary}
+    detail["cpu_s"] = round(seconds, 4)
+    if kind == "replay":
+        seconds = run.summary["update_ms"]["p99"] / 1e3
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    print(json.dumps({"seconds": seconds, "peak_memory_mb": round(peak, 1), "detail": detail}))
+
+
+def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
+    """A simulated session on disk; a process of its own, so that it costs no memory here."""
+    path = folder / f"{scenario}{'' if sigmas else '-without-sigmas'}"
+    if not path.exists():
+        code = (
+            "import sys, dataclasses, smartnav_graph as sn\n"
+            "s = sn.simulate(sys.argv[1])\n"
+            "if sys.argv[3] == 'False': s = s.replace(gnss=dataclasses.replace(s.gnss, sigma=None))\n"
+            "sn.save(s, sys.argv[2])"
+        )
+        subprocess.run([sys.executable, "-c", code, scenario, str(path), str(sigmas)], check=True)
+    return str(path)
+
+
+def middle(found: list[Measured]) -> Measured:
+    """The measurement of median time, with the largest memory."""
+    chosen = sorted(found, key=lambda one: one.seconds)[(len(found) - 1) // 2]
+    peaks = [one.peak_memory_mb for one in found if one.peak_memory_mb is not None]
+    median = statistics.median(one.seconds for one in found)
+    return Measured(median, max(peaks, default=None), {**chosen.detail, "all_s": [one.seconds for one in found]})
+
+
+Job = Callable[[], Measured]
+
+
+def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
+    """What is measured, its baseline, and what is only told beside them."""
+    plain = make_session(f"car-{MINUTES}min", folder) if name.startswith("batch") else ""
+    if name == "batch-37min":
+        return lambda: ours("batch", plain), lambda: bare("imu"), {"bare_combined": lambda: bare("combined")}
+    if name == "batch-37min-full":
+        unknown = make_session(f"car-{MINUTES}min", folder, sigmas=False)
+        return lambda: ours("full", unknown), lambda: bare("imu"), {"bare_combined": lambda: bare("combined")}
+    if name == "batch-2h":
+        long = make_session("car-2h", folder)
+        return lambda: ours("batch", long), lambda: ours("batch", plain), {}
+    return lambda: ours("replay", "gtsam-kitti"), bare_fixed_lag, {}
+
+
+def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
+    """One benchmark: job and baseline take turns, so that both see the same machine."""
+    job, baseline, beside = jobs(name, folder)
+    rounds = [(job(), baseline()) for _ in range(repeat)]
+    found, base = (middle(list(column)) for column in zip(*rounds, strict=True))
+    detail: dict[str, Any] = {"job": found.detail, "baseline": base.detail, "repeat": repeat}
+    detail |= {label: middle([other() for _ in range(min(repeat, 3))]).seconds for label, other in beside.items()}
+    return {
+        "name": name,
+        "seconds": round(found.seconds, 5),
+        "baseline_seconds": round(base.seconds, 5),
+        "ratio": round(found.seconds / base.seconds, 3),
+        "peak_memory_mb": found.peak_memory_mb,
+        "detail": detail,
+    }
+
+
+NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", choices=NAMES, help="one of them; repeatable")
+    parser.add_argument("--repeat", type=int, default=5, help="measurements each; the median counts")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--measure", nargs=2, metavar=("KIND", "SESSION"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure:
+        measure(*options.measure)
+        return
+    with tempfile.TemporaryDirectory(prefix="smartnav-benchmark-") as folder:
+        figures = []
+        print(f"{'name':<18}{'seconds':>10}{'baseline':>10}{'ratio':>8}{'peak MB':>9}")
+        for name in options.only or NAMES:
+            figures.append(benchmark(name, max(options.repeat, 1), Path(folder)))
+            f = figures[-1]
+            print(
+                f"{name:<18}{f['seconds']:>10.4f}{f['baseline_seconds']:>10.4f}{f['ratio']:>8.2f}"
+                f"{f['peak_memory_mb'] or 0:>9.0f}",
+                flush=True,
+            )
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
