@@ -89,20 +89,22 @@ def solve_passes(
     memory: Memory,
     *,
     warm: Any = None,
-    passes: int | None = None,
+    unsure: bool = False,
     progress: Progress = _silent,
 ) -> tuple[Estimate, Memory, int]:
     """Batch passes until there is nothing more to learn.
+
+    `warm` are values of an earlier solve; `unsure` says that the first state is a mere guess.
 
     Returns
     -------
     estimate, the memory it was made with, and the number of passes
     """
-    most = passes or problem.config.run.passes
+    most = problem.config.run.passes
     builders = [prior, *problem.builders]
     for count in range(1, most + 1):
         progress("solve", count - 1, most)
-        smoother = Batch(problem.config.batch, warm, problem.session.t0_ns)
+        smoother = Batch(problem.config.batch, warm, problem.session.t0_ns, unsure)
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)
@@ -120,7 +122,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         config = replace(config, stretch_s=min(config.stretch_s, config.max_stretch_s))
 
     def solve(prior: PriorBuilder, count: int) -> tuple[Estimate, Memory]:
-        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, Memory())
+        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, Memory(), unsure=True)
         return estimate, memory
 
     given = Given.parse(problem.config.run.initial) if problem.config.run.initial else None

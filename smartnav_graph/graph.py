@@ -5,7 +5,7 @@ The seam of the house: a builder reads one `Window` and adds to one `Step`; a sm
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -96,6 +96,7 @@ class Step:
     """What one window adds to the graph.
 
     predicted : state at t1 that the inertial data foretell; variance (3,) of its position m^2, where known
+    foretell : (nav, bias) at t0 -> nav at t1, for states that have moved since
     """
 
     index: int
@@ -104,6 +105,7 @@ class Step:
     predicted: Any = None
     bias: Any = None
     variance: Floats | None = None
+    foretell: Callable[[Any, Any], Any] | None = None
     factors: list[tuple[Tag, Any]] = field(default_factory=list)
     chain: dict[int, Any] = field(default_factory=dict)
 

@@ -29,8 +29,11 @@ from smartnav_graph.timebase import NS, seconds_since
 
 Floats = NDArray[np.float64]
 
-# Cost a keyframe above which a fit of the first stretch is bad (a good one has about one).
-GOOD_COST = 5.0
+# Cost a keyframe above which a fit of the first stretch is bad (a good one has 1.5), and what a rejected fix costs:
+# a start must not look good because it rejects what contradicts it.
+GOOD_COST = 2.5
+REJECTION_COST = 10.0
+KABSCH_S = (12.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -326,7 +329,7 @@ class Initialiser:
                 tried += 1
                 results += self._attempt(solve, state, rest, count)
                 if len(results) == 1 and results[0][0] < GOOD_COST * count and (self._sure(results[0][1]) or not last):
-                    break
+                    break  # a good fit from the likeliest start
             if results:
                 best = min(results, key=lambda item: item[0])[1]
                 if last or self._sure(best):
@@ -349,7 +352,8 @@ class Initialiser:
             estimate, memory = solve(self._prior(state, rest), count)
         except SolverError:
             return []
-        return [(estimate.cost, self._found(estimate, memory, rest, count))] if estimate.converged else []
+        rejected = sum(len(rows) for rows in memory.rejected.values())
+        return [(estimate.cost + REJECTION_COST * rejected, self._found(estimate, memory, rest, count))]
 
     def _count(self, stretch_s: float) -> int:
         """Windows up to `stretch_s` after the first fix."""
@@ -367,18 +371,18 @@ class Initialiser:
         bias = gtsam.imuBias.ConstantBias() if rest is None else gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
         ends = np.array([w.t1_ns for w in windows])
         t = (t_ns - ends[0]) / NS
-        starts = []
+        starts: list[State] = []
         p0, v0 = fixes[0], np.zeros(3)
         up = self._level(rest)
         if len(t_ns) >= 2 and rest is None:
             v0 = (fixes[1] - fixes[0]) / (t[1] - t[0])
             p0 = fixes[0] - v0 * t[0]
-        if len(t_ns) >= 4:
-            curve = inertial_curve(windows, bias)[np.minimum(np.searchsorted(ends, t_ns), count - 1)]
-            R, p, v = kabsch_attitude(curve, fixes, t, self.gravity)
-            starts.append(self._state(R, p, v, rest))
-            if rest is None:
-                up = R[2]
+        curve = inertial_curve(windows, bias)[np.minimum(np.searchsorted(ends, t_ns), count - 1)]
+        for length in KABSCH_S:  # the shorter curve suffers less from an unknown gyro bias, the longer from noise
+            near = t <= t[0] + length
+            if near.sum() >= 4 and not (starts and near.all()):
+                R, p, v = kabsch_attitude(curve[near], fixes[near], t[near], self.gravity)
+                starts.append(self._state(R, p, v, rest))
         if magnetic is not None:
             starts.insert(0, self._state(frames.nav_R_body_from_heading(magnetic, up, self.forward), p0, v0, rest))
         course = np.degrees(np.arctan2(v0[0], v0[1])) if np.linalg.norm(v0[:2]) > 1.0 else 0.0

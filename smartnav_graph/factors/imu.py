@@ -146,6 +146,7 @@ class ImuBuilder:
         pim = self.preintegrate(window, previous.bias, memory)
         step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias
+        step.foretell = pim.predict
         if previous.covariance is not None:
             step.variance = self._variance(pim, window.length_s, previous, previous.covariance)
         tag = Tag("imu", window.t1_ns)

@@ -7,7 +7,7 @@ does not lower the cost.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,6 +50,10 @@ _TRUST = {
 }
 
 
+# Growing stretches shorter than this hold the first attitude.
+HOLD_S = 10.0
+
+
 @dataclass(frozen=True)
 class Solve:
     """Result of `minimise`."""
@@ -60,8 +64,17 @@ class Solve:
     converged: bool
 
 
-def minimise(graph: Any, values: Any, order: gtsam.Ordering, config: BatchConfig) -> Solve:
+def minimise(
+    graph: Any,
+    values: Any,
+    order: gtsam.Ordering,
+    config: BatchConfig,
+    shoot: Callable[[Any], Any] | None = None,
+) -> Solve:
     """Levenberg-Marquardt with Gauss-Newton steps first.
+
+    `shoot` replaces the states of a candidate by those its first state foretells. Where a Gauss-Newton step fails only
+    because rotations far along the stretch turn on curves (an unknown gyro bias), the shot finds the valley's floor.
 
     Raises
     ------
@@ -84,6 +97,12 @@ def minimise(graph: Any, values: Any, order: gtsam.Ordering, config: BatchConfig
             new_cost = graph.error(candidate)
             if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-12:
                 break
+            if shoot is not None and damping == 0.0:
+                shot = shoot(candidate)
+                shot_cost = graph.error(shot)
+                if np.isfinite(shot_cost) and shot_cost < cost:
+                    candidate, new_cost = shot, shot_cost
+                    break
             damping = max(10.0 * damping, 1e-2)
             if damping > 1e10:
                 return Solve(values, cost, iterations, _stationary(linear, order))
@@ -116,15 +135,17 @@ def _stationary(linear: Any, order: gtsam.Ordering) -> bool:
 class Batch:
     """Collects steps; `estimate` solves them.
 
-    warm : values of an earlier pass, taken for every state they hold.
+    warm : values of an earlier pass, taken for every state they hold; unsure : the first state is a mere guess
     """
 
     config: BatchConfig = field(default_factory=BatchConfig)
     warm: Any = None
     t0_ns: int = 0
+    unsure: bool = False
     steps: list[Step] = field(default_factory=list)
     values: Any = field(default_factory=gtsam.Values)
     _settled: int = 0
+    _growth: float = 2.0
     _anchor: Any = None
 
     def latest(self) -> State | None:
@@ -141,8 +162,9 @@ class Batch:
             self._take_warm(step)
             return
         self.values.insert(step.values())
-        if step.t_s - self.steps[self._settled].t_s >= self.config.settle_s:
-            self._settle()
+        since = step.t_s - self.steps[self._settled].t_s
+        if since >= self._stretch():
+            self._settle(since)
 
     def _take_warm(self, step: Step) -> None:
         i = step.index
@@ -150,8 +172,15 @@ class Batch:
         self.values.insert(key("V", i), self.warm.atVector(key("V", i)))
         self.values.insert(key("B", i), self.warm.atConstantBias(key("B", i)))
 
-    def _settle(self) -> None:
-        """Solve the steps since the last settled one, held there by its marginals."""
+    def _stretch(self) -> float:
+        return min(self._growth, self.config.settle_s) if self.unsure else self.config.settle_s
+
+    def _settle(self, since: float) -> None:
+        """Solve the steps since the last settled one, held there by its marginals.
+
+        Where the first state is unsure its stretch grows by doubling from the beginning: an unknown gyro bias turns a
+        dead-reckoned guess away before there are enough fixes to stop it.
+        """
         stretch = self.steps[self._settled :]
         first = self._settled == 0
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -165,15 +194,26 @@ class Batch:
             values.insert(key("B", i), self.values.atConstantBias(key("B", i)))
         if not first:
             graph.push_back(self._anchor)
+        elif since < HOLD_S:
+            graph.push_back(_hold(self.steps[0]))
         order = elimination_order(indices)
         try:
-            solve = minimise(graph, values, order, BatchConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0))
+            solve = minimise(
+                graph,
+                values,
+                order,
+                BatchConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0),
+                lambda candidate: _shot(stretch, candidate),
+            )
+            self.values.update(solve.values)
+            if self._stretch() < self.config.settle_s:
+                self._growth *= 2.0
+                return
             tree = graph.linearize(solve.values).eliminateMultifrontal(order, gtsam.EliminateQR)
             self._anchor = _anchor(tree, solve.values, indices[-1])
+            self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
             return  # not observable yet: a longer stretch is tried at the next step
-        self.values.update(solve.values)
-        self._settled = len(self.steps) - 1
 
     def graph(self) -> Any:
         """All factors taken so far."""
@@ -216,6 +256,27 @@ class Batch:
         t_ns = {step.index: step.t_ns for step in self.steps}
         touching = {step.index: {tag.sensor for tag, _ in step.factors} for step in self.steps}
         return indeterminate(error, t_ns, self.t0_ns, touching)
+
+
+def _hold(step: Step) -> Any:
+    """Keeps the attitude of the first keyframe near its guess: seconds of noisy fixes say nothing of it."""
+    model = gtsam.noiseModel.Isotropic.Sigma(3, 0.2)
+    return gtsam.PoseRotationPrior3D(key("X", step.index), step.predicted.attitude(), model)
+
+
+def _shot(steps: Sequence[Step], values: Any) -> Any:
+    """The states that the first one foretells, all with its bias."""
+    state = state_at(values, steps[0].index, steps[0].t_ns)
+    nav, bias = state.nav, state.bias
+    shot = gtsam.Values(values)
+    for step in steps[1:]:
+        if step.foretell is None:
+            return values
+        nav = step.foretell(nav, bias)
+        shot.update(key("X", step.index), nav.pose())
+        shot.update(key("V", step.index), nav.velocity())
+        shot.update(key("B", step.index), bias)
+    return shot
 
 
 def _eliminate(linear: Any, order: gtsam.Ordering) -> Any:
