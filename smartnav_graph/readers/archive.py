@@ -52,4 +52,15 @@ def _unpack(path: Path, folder: Path, kind: str) -> None:
         shutil.unpack_archive(path, folder, "zip")
         return
     with tarfile.open(path) as archive:
-        archive.extractall(folder, filter="data")
+        if hasattr(tarfile, "data_filter"):
+            archive.extractall(folder, filter="data")
+        else:  # Python before 3.11.4
+            _refuse_harmful(archive, folder.resolve())
+            archive.extractall(folder)
+
+
+def _refuse_harmful(archive: tarfile.TarFile, folder: Path) -> None:
+    """What the filter of newer Pythons does: nothing outside the folder, and only files and folders."""
+    for member in archive.getmembers():
+        if not (member.isfile() or member.isdir()) or not (folder / member.name).resolve().is_relative_to(folder):
+            raise tarfile.TarError(f"{member.name} is no file or folder inside the archive")

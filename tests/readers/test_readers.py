@@ -1,6 +1,7 @@
 """The registry: recognition by content, archives, and errors that name the formats."""
 
 import shutil
+import tarfile
 
 import pytest
 
@@ -95,6 +96,20 @@ def test_faults_in_archives_name_the_archive(folder, tmp_path):
     damaged.write_bytes(data)
     with pytest.raises(SessionError, match=r"damaged.zip: cannot be unpacked"):
         readers.read(damaged)
+
+
+@pytest.mark.parametrize("filtered", [True, False], ids=["python >= 3.11.4", "older"])
+@pytest.mark.parametrize(("name", "kind"), [("../evil.txt", tarfile.REGTYPE), ("link", tarfile.SYMTYPE)])
+def test_an_archive_that_reaches_outside_itself_is_refused(tmp_path, monkeypatch, name, kind, filtered):
+    if not filtered:
+        monkeypatch.delattr(tarfile, "data_filter", raising=False)
+    member = tarfile.TarInfo(name)
+    member.type, member.linkname = kind, "/etc/passwd" if kind == tarfile.SYMTYPE else ""
+    with tarfile.open(tmp_path / "log.tar", "w") as archive:
+        archive.addfile(member)
+    with pytest.raises(SessionError, match=r"log\.tar: cannot be unpacked"):
+        readers.read(tmp_path / "log.tar")
+    assert [path.name for path in tmp_path.iterdir()] == ["log.tar"]
 
 
 def test_an_archive_of_a_single_log_file(tmp_path):
