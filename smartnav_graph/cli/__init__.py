@@ -6,9 +6,12 @@ import difflib
 import importlib
 import logging
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
@@ -53,7 +56,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     The exit code.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # the reader of our output (head, less) has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _dispatch(arguments: list[str]) -> int:
     if not arguments:
         print(overview(), file=sys.stderr)
         return 2
@@ -66,20 +78,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, 1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        print(f"smartnav: no command {name!r}{hint} See smartnav --help", file=sys.stderr)
+        hint = f"; did you mean {close[0]}?" if close else ";"
+        print(f"smartnav: no command {name!r}{hint} see smartnav --help", file=sys.stderr)
         return 2
     return _run(name, rest)
 
 
 def _run(name: str, rest: list[str]) -> int:
-    from smartnav_graph.cli.options import parse
-
     try:
-        command = parse(command_class(name), name, rest)
+        with _interrupt_ends_process():
+            kind = command_class(name)
+        from smartnav_graph.cli.options import parse
+
+        command = parse(kind, name, rest)
         logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
         command.run()
-        sys.stdout.flush()
         return 0
     except SmartnavError as error:
         if "--debug" in rest:
@@ -89,11 +102,21 @@ def _run(name: str, rest: list[str]) -> int:
     except KeyboardInterrupt:
         print("smartnav: interrupted; nothing was written", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader of our output (head, less) has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except SystemExit as exit:  # help was asked for, or the arguments are wrong
         return exit.code if isinstance(exit.code, int) else 2
+
+
+@contextmanager
+def _interrupt_ends_process() -> Iterator[None]:
+    """Ctrl-C while compiled libraries load would come out of them as an ImportError: let it end the process instead."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def command_class(name: str) -> type[Command]:
