@@ -229,7 +229,8 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
         ("evaluate run --reference run/trajectory.csv.gz", "trajectory.csv.gz"),
         ("evaluate run --reference eight --time-offset 1e6", "run"),
         ("compare run nowhere", "nowhere: is no folder; expected a run folder"),
-        ("export run --format tum --out eight", "eight: exists already"),
+        ("export run --format tum --out eight --force", "eight: is a folder; expected the name of a file"),
+        ("export run --format tum --out eight/session.toml", "eight/session.toml: exists already"),
         ("view nowhere --web", "nowhere: does not exist"),
     ],
 )

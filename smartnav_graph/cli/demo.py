@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from smartnav_graph import readers
+from smartnav_graph import estimate, readers
 from smartnav_graph import session as session_model
 from smartnav_graph.cli.options import Command, OutPath, progress
 from smartnav_graph.cli.text import print_findings, run_text, withheld_lines
 from smartnav_graph.config import Config, RunConfig
 from smartnav_graph.errors import SessionError
+from smartnav_graph.run_folder import write_run
 from smartnav_graph.session import Session
 
 MARK = ".smartnav-demo"
@@ -42,9 +43,6 @@ class Demo(Command):
         print(f"see  smartnav view {self.out / 'euroc'} [--web]")
 
     def _smooth(self, session: Session, config: Config, out: Path, *, brief: bool = False) -> None:
-        from smartnav_graph import estimate
-        from smartnav_graph.run_folder import write_run
-
         with progress(self.quiet) as show:
             run = estimate.smooth(session, config, progress=show)
         summary = write_run(run, out, force=True)

@@ -10,12 +10,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from smartnav_graph import readers
+from smartnav_graph import estimate, readers
 from smartnav_graph.cli.options import Estimating, Writing, given, progress, repairs
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.config import Config
-from smartnav_graph.errors import SmartnavError
-from smartnav_graph.evaluation import Evaluation
+from smartnav_graph.errors import SessionError, SmartnavError
+from smartnav_graph.evaluation import Evaluation, evaluate
+from smartnav_graph.export import export
 from smartnav_graph.run_folder import check_out, read_run, write_run
 
 
@@ -55,8 +56,6 @@ class Replay(Estimating):
 
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> None:
     """Load, estimate, write, tell."""
-    from smartnav_graph import estimate
-
     check_out(command.out, command.force)
     begin = time.perf_counter()
     session = readers.load(command.session, repairs=repairs(command.repair))
@@ -70,12 +69,8 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
     print_findings(run_text(summary, command.out))
 
 
-def against_own_reference(run: object) -> Evaluation | None:
+def against_own_reference(run: estimate.Run) -> Evaluation | None:
     """The comparison with the session's own reference, where it has one on the same clock."""
-    from smartnav_graph.estimate import Run
-    from smartnav_graph.evaluation import evaluate
-
-    assert isinstance(run, Run)
     if run.session.reference is None:
         return None
     try:
@@ -102,8 +97,8 @@ class Export(Writing):
     """Which of a replay's two."""
 
     def run(self) -> None:
-        from smartnav_graph.export import export
-
         run = read_run(self.run_path)
+        if self.out.is_dir():  # --force is for an older export, not for a folder
+            raise SessionError(self.out, "is a folder", "the name of a file", "choose another --out")
         export(run.named(self.solution), self.format, self.out, force=self.force, clock_epoch=run.clock_epoch)
         print(f"{self.format}: {self.out}")

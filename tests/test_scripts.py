@@ -1,0 +1,83 @@
+"""What a newcomer runs first: the scripts, and the versions they install."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import smartnav_graph as sn
+
+ROOT = Path(__file__).parents[1]
+
+
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    rows = [line for line in lines if line and not line.startswith("#")]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.+!]+", row) for row in rows)  # names and versions only: no place, no address
+    return {canonical(row.split("==")[0]): row.split("==")[1] for row in rows}
+
+
+def test_every_declared_dependency_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = [*project["dependencies"], *project["optional-dependencies"]["test"]]
+    names = {canonical(re.split(r"[<>=!~ ]", text)[0]) for text in declared}
+    assert names <= set(pins())
+
+
+def test_the_versions_that_matter_are_the_pinned_ones():
+    for name in ("gtsam", "rerun-sdk", "opencv-python-headless", "pycolmap"):
+        assert version(name) == pins()[name]
+
+
+@pytest.mark.parametrize("name", ["scripts/demo", "scripts/test", "scripts/benchmark", ".ci/run"])
+def test_scripts_can_be_run(name):
+    assert os.access(ROOT / name, os.X_OK)
+    subprocess.run(["bash", "-n", ROOT / name], check=True)
+
+
+def find_python(path: Path) -> subprocess.CompletedProcess[str]:
+    command = f"source {ROOT}/scripts/environment.sh && find_python"
+    environment = {"PATH": str(path)}
+    return subprocess.run(["/bin/bash", "-c", command], env=environment, capture_output=True, text=True, check=False)
+
+
+def tool(folder: Path, name: str, code: str) -> None:
+    (folder / name).write_text(f"#!/bin/sh\n{code}\n")
+    (folder / name).chmod(0o755)
+
+
+def test_an_old_python_is_passed_over_and_its_absence_told(tmp_path):
+    tool(tmp_path, "dirname", 'exec /usr/bin/dirname "$@"')
+    tool(tmp_path, "python3.12", "exit 127")  # a shim without a version behind it
+    tool(tmp_path, "python3", "exit 1")  # too old
+    done = find_python(tmp_path)
+    assert done.returncode != 0 and done.stdout == ""
+    assert "No Python of 3.11, 3.12 or 3.13 with venv was found; install one" in done.stderr
+    tool(tmp_path, "python3.11", f'exec {sys.executable} "$@"')
+    assert find_python(tmp_path).stdout == "python3.11\n"
+
+
+def test_a_benchmark_measures_a_fresh_process(tmp_path):
+    sn.save(sn.simulate("figure-eight-60s"), tmp_path / "eight")
+    command = [sys.executable, ROOT / "scripts" / "benchmark.py", "--measure", "replay", tmp_path / "eight"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    assert set(told) == {"seconds", "peak_memory_mb", "detail"}
+    assert told["detail"]["keyframes"] == 61 and told["peak_memory_mb"] > 50
+    assert told["seconds"] == pytest.approx(told["detail"]["update_ms"]["p99"] / 1e3)
+
+
+def test_the_baseline_runs():
+    command = [sys.executable, ROOT / "scripts" / "bare_gtsam.py", "2", "imu"]
+    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert set(told["cpu_s"]) == {"preintegrate", "build", "solve", "covariance"} and told["rms_m"] < 10.0
