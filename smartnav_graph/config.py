@@ -21,6 +21,7 @@ from smartnav_graph.keyframes import KeyframeConfig
 from smartnav_graph.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
 from smartnav_graph.smoothers.incremental import ReplayConfig
+from smartnav_graph.smoothers.minimise import SolveConfig
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class Config:
     gnss: GnssConfig = field(default_factory=GnssConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
+    solve: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
 

@@ -30,6 +30,7 @@ from smartnav_graph.smoothers import Smoother
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import Estimate, largest_difference
 from smartnav_graph.smoothers.incremental import Incremental
+from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.summary import summarise
 
@@ -101,10 +102,11 @@ def solve_passes(
     estimate, the memory it was made with, and the number of passes
     """
     most = problem.config.run.passes
+    precision = FIRST if unsure else problem.config.solve
     builders = [prior, *problem.builders]
     for count in range(1, most + 1):
         progress("solve", count - 1, most)
-        smoother = Batch(problem.config.batch, warm, problem.session.t0_ns, unsure)
+        smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure)
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)

@@ -5,7 +5,7 @@ Nothing is repaired here. Every rule is a small generator of findings; `RULES` i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,20 +115,21 @@ class Facts:
         return imu if imu is not None and len(imu) >= 10 else None
 
 
-def inspect(session: Session) -> Health:
-    """Look a session over.
+def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
+    """Look a session over; `gaps` of the inertial stream, where they are known already.
 
     Streams that will not be used can be left out first: ``inspect(session.replace(magnetometer=None))``.
     """
     imu = session.imu
     usable = imu is not None and len(imu) >= 2
-    gaps = tuple(find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel]))) if usable and imu is not None else ()
-    facts = Facts(session, gaps, quiet_accel(imu) if usable and imu is not None else None)
+    if gaps is None:
+        gaps = find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel])) if usable and imu is not None else ()
+    facts = Facts(session, tuple(gaps), quiet_accel(imu) if usable and imu is not None else None)
     findings = [finding for rule in RULES for finding in rule(facts)]
     order = {"error": 0, "warning": 1, "info": 2}
     return Health(
         streams=tuple(_stream_health(session, name, stream) for name, stream in session.streams().items()),
-        gaps=gaps,
+        gaps=facts.gaps,
         clock_epoch=session.clock_epoch,
         gravity_m_s2=session.gravity,
         quiet_accel_m_s2=facts.quiet_accel,
@@ -288,7 +289,7 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
 
 
-def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
+def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 120) -> dict[float, float] | None:
     """How far gravity turned by the gyro ends from the accelerometer's, for three units of the gyro.
 
     For windows at whose ends |accel| is near its median, the up direction a_0 (body axes) is carried through the

@@ -97,7 +97,8 @@ def make_windows(
     gaps : stretches whose windows are of kind ``gap``
     aiding : stamps of every aiding stream; each row goes to the keyframe it shares its epoch with
     """
-    grid = np.union1d(imu.t_ns[(imu.t_ns > times[0]) & (imu.t_ns < times[-1])], times)
+    grid = np.sort(np.concatenate([imu.t_ns[(imu.t_ns > times[0]) & (imu.t_ns < times[-1])], times]), kind="stable")
+    grid = grid[np.concatenate([[True], np.diff(grid) > 0])]
     samples = interpolate(grid, imu.t_ns, np.concatenate([imu.accel, imu.gyro], axis=1))
     means = 0.5 * (samples[1:] + samples[:-1])
     dt = np.diff(grid) / NS

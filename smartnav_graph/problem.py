@@ -61,7 +61,7 @@ def prepare(session: Session, config: Config) -> Problem:
         bridged_rows=g.bridged_rows,
         straightness=g.straightness,
     )
-    checked = health.inspect(session)
+    checked = health.inspect(session, gaps)
     checked.raise_errors()
     warnings = checked.warnings()
     session = _choose_sensors(session, config.run.sensors)

@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 # No fix is believed better than this, metres: clocks and lever arms are not.
 LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
+# Outliers are looked for when the worst fix of all would be so rare among good ones.
+SURPRISE = 0.01
 MEDIAN_CHI2_3 = float(chi2(3).median())
 
 
@@ -71,9 +73,10 @@ def revise(
     new = memory
     for builder, residuals in found.values():
         new = _rescaled(builder, residuals, new)
-    outliers = {b.name: _outside(b, r, new) for b, r in found.values() if b.config.loss == "gate"}
-    if memory.phase == "plain" and any(outliers.values()):
+    gated = [(b, r) for b, r in found.values() if b.config.loss == "gate"]
+    if memory.phase == "plain" and any(_outside(b, r, new, 1.0 - SURPRISE / len(r.rows)) for b, r in gated):
         return replace(new, phase="robust"), False
+    outliers = {b.name: _outside(b, r, new) for b, r in gated}
     if memory.phase == "robust":
         return replace(new, phase="gated", rejected=outliers), False
     if memory.phase == "gated":
@@ -96,8 +99,10 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> 
     return replace(memory, noise_scales={**memory.noise_scales, builder.name: scale})
 
 
-def _outside(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> frozenset[int]:
+def _outside(
+    builder: PositionBuilder, found: FixResiduals, memory: Memory, probability: float | None = None
+) -> frozenset[int]:
     """Rows beyond the gate, at the robust level of all rows."""
     square = ((found.residual / builder.scaled_sigma(memory)[found.rows]) ** 2).sum(axis=1)
-    outside = builder.gate(square, float(np.median(square)) / MEDIAN_CHI2_3, found.rows)
+    outside = builder.gate(square, float(np.median(square)) / MEDIAN_CHI2_3, found.rows, probability)
     return frozenset(int(row) for row in found.rows[outside])

@@ -89,13 +89,15 @@ class PositionBuilder:
         """Sigmas (n, 3) m after the noise scale of this sensor."""
         return np.where(self.own_sigma[:, None], self.sigma, self.sigma * memory.scale(self.name))
 
-    def gate(self, square: Floats, level: float, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which rows, of normalised squares (m,), lie outside the chi-square gate.
+    def gate(
+        self, square: Floats, level: float, rows: NDArray[np.intp], probability: float | None = None
+    ) -> NDArray[np.bool_]:
+        """Which rows, of normalised squares (m,), lie outside the chi-square gate (of the configured probability).
 
         `level` widens it with the robust level of all rows, so that optimistic sigmas reject nothing wholesale; rows
         whose sigma was estimated get twice the sigma: what tails the noise of such fixes has is part of it.
         """
-        limit = float(chi2(3).ppf(self.config.gate_probability)) * max(1.0, level)
+        limit = float(chi2(3).ppf(probability or self.config.gate_probability)) * max(1.0, level)
         return np.asarray(square > limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
 
     def _loss_of(self, row: int, sigma: Floats, step: Step, memory: Memory) -> str:

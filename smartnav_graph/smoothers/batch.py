@@ -1,13 +1,8 @@
-"""All steps at once: Levenberg-Marquardt over `graph.linearize`.
-
-The loop is ours because GTSAM's own copies all values into Python for every custom factor, and because a nested
-dissection of time makes the marginals four times cheaper. Gauss-Newton steps are tried first; damping comes when one
-does not lower the cost.
-"""
+"""All steps at once, with the stretches in between settled on the way so that no guess is a mere dead reckoning."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +10,7 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import State, Step, Tag, key
+from smartnav_graph.graph import State, Step, key
 from smartnav_graph.smoothers.estimate import (
     Estimate,
     elimination_order,
@@ -23,112 +18,30 @@ from smartnav_graph.smoothers.estimate import (
     nav_covariances,
     state_at,
 )
+from smartnav_graph.smoothers.minimise import COARSE, SolveConfig, minimise
 
 
 @dataclass(frozen=True)
 class BatchConfig:
     """settle_s : stretch after which the latest steps are solved by themselves, so that later windows start from an
-    anchored state; tolerance, step_tolerance : relative decrease of the cost, and largest step in units of a
-    third of a radian, 100 m, 10 m/s, that end the iteration."""
+    anchored state; it doubles up to longest_settle_s while that is easy."""
 
-    max_iterations: int = 50
-    tolerance: float = 1e-7
-    step_tolerance: float = 1e-5
     settle_s: float = 30.0
+    longest_settle_s: float = 240.0
 
     def __post_init__(self) -> None:
-        if not (self.max_iterations > 0 and self.tolerance > 0 and self.settle_s > 0):
-            raise ConfigError("config [batch]", "a value <= 0", "> 0")
-
-
-# Step sizes that a damping of one holds a state to: rad, m; m/s; m/s^2, rad/s; m.
-_TRUST = {
-    "X": np.array([0.3] * 3 + [100.0] * 3),
-    "V": np.full(3, 10.0),
-    "B": np.array([0.3] * 3 + [0.02] * 3),
-    "C": np.full(3, 10.0),
-}
+        if not 0 < self.settle_s <= self.longest_settle_s:
+            raise ConfigError(
+                "config [batch]",
+                f"settle_s = {self.settle_s}, longest_settle_s = {self.longest_settle_s}",
+                "0 < settle_s <= longest_settle_s",
+            )
 
 
 # Growing stretches shorter than this hold the first attitude.
 HOLD_S = 10.0
-
-
-@dataclass(frozen=True)
-class Solve:
-    """Result of `minimise`."""
-
-    values: Any
-    cost: float
-    iterations: int
-    converged: bool
-
-
-def minimise(
-    graph: Any,
-    values: Any,
-    order: gtsam.Ordering,
-    config: BatchConfig,
-    shoot: Callable[[Any], Any] | None = None,
-) -> Solve:
-    """Levenberg-Marquardt with Gauss-Newton steps first.
-
-    `shoot` replaces the states of a candidate by those its first state foretells. Where a Gauss-Newton step fails only
-    because rotations far along the stretch turn on curves (an unknown gyro bias), the shot finds the valley's floor.
-
-    Raises
-    ------
-    RuntimeError
-        GTSAM finds the linear system indeterminate with Cholesky and with QR.
-    SolverError
-        The cost is not finite, or no step lowers it.
-    """
-    cost = graph.error(values)
-    if not np.isfinite(cost):
-        raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
-    trust = np.concatenate([_TRUST[chr(gtsam.symbolChr(name))] for name in list(values.keys())])
-    damping, iterations, converged = 0.0, 0, False
-    while iterations < config.max_iterations and not converged:
-        iterations += 1
-        linear = graph.linearize(values)
-        while True:
-            delta = _step(linear, order, damping)
-            candidate = values.retract(delta)
-            new_cost = graph.error(candidate)
-            if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-12:
-                break
-            if shoot is not None and damping == 0.0:
-                shot = shoot(candidate)
-                shot_cost = graph.error(shot)
-                if np.isfinite(shot_cost) and shot_cost < cost:
-                    candidate, new_cost = shot, shot_cost
-                    break
-            damping = max(10.0 * damping, 1e-2)
-            if damping > 1e10:
-                return Solve(values, cost, iterations, _stationary(linear, order))
-        small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
-        converged = damping <= 1.0 and small and cost - new_cost <= config.tolerance * max(new_cost, 1.0)
-        values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
-    return Solve(values, cost, iterations, converged)
-
-
-def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
-    if damping:
-        linear = linear.clone()
-        for i in range(order.size()):
-            name = order.at(i)
-            scale = _TRUST[chr(gtsam.symbolChr(name))]
-            model = gtsam.noiseModel.Unit.Create(len(scale))
-            linear.push_back(gtsam.JacobianFactor(name, np.diag(np.sqrt(damping) / scale), np.zeros(len(scale)), model))
-    try:
-        return linear.optimize(order)
-    except RuntimeError:
-        return linear.optimize(order, gtsam.EliminateQR)
-
-
-def _stationary(linear: Any, order: gtsam.Ordering) -> bool:
-    """Whether the undamped step is negligible: nothing lowers the cost because it is lowest already."""
-    return bool(np.abs(_step(linear, order, 0.0).vector()).max() < 1e-4)
+# A settled stretch that took no more iterations than this may be longer next time.
+EASY = 6
 
 
 @dataclass
@@ -139,14 +52,18 @@ class Batch:
     """
 
     config: BatchConfig = field(default_factory=BatchConfig)
+    solve: SolveConfig = field(default_factory=SolveConfig)
     warm: Any = None
     t0_ns: int = 0
     unsure: bool = False
     steps: list[Step] = field(default_factory=list)
     values: Any = field(default_factory=gtsam.Values)
     _settled: int = 0
-    _growth: float = 2.0
+    _stretch_s: float = 0.0
     _anchor: Any = None
+
+    def __post_init__(self) -> None:
+        self._stretch_s = min(2.0, self.config.settle_s) if self.unsure else self.config.settle_s
 
     def latest(self) -> State | None:
         """Latest state: of the warm values, of the last settled stretch, or predicted since then."""
@@ -163,7 +80,7 @@ class Batch:
             return
         self.values.insert(step.values())
         since = step.t_s - self.steps[self._settled].t_s
-        if since >= self._stretch():
+        if since >= self._stretch_s:
             self._settle(since)
 
     def _take_warm(self, step: Step) -> None:
@@ -171,9 +88,6 @@ class Batch:
         self.values.insert(key("X", i), self.warm.atPose3(key("X", i)))
         self.values.insert(key("V", i), self.warm.atVector(key("V", i)))
         self.values.insert(key("B", i), self.warm.atConstantBias(key("B", i)))
-
-    def _stretch(self) -> float:
-        return min(self._growth, self.config.settle_s) if self.unsure else self.config.settle_s
 
     def _settle(self, since: float) -> None:
         """Solve the steps since the last settled one, held there by its marginals.
@@ -198,22 +112,21 @@ class Batch:
             graph.push_back(_hold(self.steps[0]))
         order = elimination_order(indices)
         try:
-            solve = minimise(
-                graph,
-                values,
-                order,
-                BatchConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0),
-                lambda candidate: _shot(stretch, candidate),
-            )
-            self.values.update(solve.values)
-            if self._stretch() < self.config.settle_s:
-                self._growth *= 2.0
-                return
-            tree = graph.linearize(solve.values).eliminateMultifrontal(order, gtsam.EliminateQR)
-            self._anchor = _anchor(tree, solve.values, indices[-1])
-            self._settled = len(self.steps) - 1
+            solve = minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate))
+            if self._stretch_s >= self.config.settle_s:
+                tree = graph.linearize(solve.values).eliminateMultifrontal(order, gtsam.EliminateQR)
+                self._anchor = _anchor(tree, solve.values, indices[-1])
+                self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
             return  # not observable yet: a longer stretch is tried at the next step
+        self.values.update(solve.values)
+        if self._stretch_s < self.config.settle_s or solve.iterations <= EASY:
+            self._stretch_s = min(2.0 * self._stretch_s, self.config.longest_settle_s)
+        else:
+            self._stretch_s = self.config.settle_s
+
+    def _shoot(self, candidate: Any) -> Any:
+        return _shot(self.steps, candidate)
 
     def graph(self) -> Any:
         """All factors taken so far."""
@@ -234,7 +147,7 @@ class Batch:
         graph, indices = self.graph(), [step.index for step in self.steps]
         order = elimination_order(indices)
         try:
-            solve = minimise(graph, self.values, order, self.config)
+            solve = minimise(graph, self.values, order, self.solve, self._shoot if self.unsure else None)
             tree = _eliminate(graph.linearize(solve.values), order)
             covariance = nav_covariances(tree, solve.values, indices)
         except RuntimeError as error:
@@ -319,6 +232,3 @@ def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None
             "an absolute measurement nearby",
             "add position fixes, control points or standstills, or give --initial",
         )
-
-
-__all__ = ["Batch", "BatchConfig", "Solve", "Tag", "check_covariance", "minimise"]

@@ -1,0 +1,131 @@
+"""Levenberg-Marquardt over `graph.linearize`, Gauss-Newton first.
+
+The loop is ours because GTSAM's own copies all values into Python for every custom factor, and because an elimination
+order of our own makes the marginals cheap. Damping comes only when a Gauss-Newton step does not lower the cost.
+
+Source: Nocedal, Wright (2006), Numerical Optimization, 10.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from smartnav_graph.errors import ConfigError, SolverError
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """tolerance, step_tolerance : relative decrease of the cost, and largest step in units of a third of a radian,
+    100 m, 10 m/s, that together end the iteration."""
+
+    max_iterations: int = 50
+    tolerance: float = 1e-7
+    step_tolerance: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if not (self.max_iterations > 0 and self.tolerance > 0 and self.step_tolerance > 0):
+            raise ConfigError("config [solve]", "a value <= 0", "> 0")
+
+
+# Enough to go on from: a later solve finishes the work.
+COARSE = SolveConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0)
+FIRST = SolveConfig(max_iterations=40, tolerance=1e-4, step_tolerance=1e-2)
+
+
+# Step sizes that a damping of one holds a state to: rad, m; m/s; m/s^2, rad/s; m.
+_TRUST = {
+    "X": np.array([0.3] * 3 + [100.0] * 3),
+    "V": np.full(3, 10.0),
+    "B": np.array([0.3] * 3 + [0.02] * 3),
+    "C": np.full(3, 10.0),
+}
+
+
+@dataclass(frozen=True)
+class Solve:
+    """Result of `minimise`."""
+
+    values: Any
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    graph: Any,
+    values: Any,
+    order: gtsam.Ordering,
+    config: SolveConfig,
+    shoot: Callable[[Any], Any] | None = None,
+) -> Solve:
+    """Levenberg-Marquardt with Gauss-Newton steps first.
+
+    `shoot` replaces the states of a candidate by those its first state foretells. Where a step fails only because
+    rotations far along the stretch turn on curves (an unknown gyro bias), the shot lands on the valley's floor.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM finds the linear system indeterminate with Cholesky and with QR.
+    SolverError
+        The cost is not finite, or no step lowers it.
+    """
+    cost = graph.error(values)
+    if not np.isfinite(cost):
+        raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
+    trust = np.concatenate([_TRUST[chr(gtsam.symbolChr(name))] for name in list(values.keys())])
+    damping, iterations, converged = 0.0, 0, False
+    while iterations < config.max_iterations and not converged:
+        iterations += 1
+        linear = graph.linearize(values)
+        while True:
+            delta = _step(linear, order, damping)
+            candidate, new_cost = _better(graph, values.retract(delta), shoot)
+            if new_cost <= cost * (1 + 1e-9) + 1e-12:
+                break
+            damping = max(10.0 * damping, 1e-2)
+            if damping > 1e10:
+                return Solve(values, cost, iterations, _stationary(linear, order))
+        small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
+        converged = damping <= 1.0 and small and cost - new_cost <= config.tolerance * max(new_cost, 1.0)
+        values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
+    return Solve(values, cost, iterations, converged)
+
+
+def _better(graph: Any, candidate: Any, shoot: Callable[[Any], Any] | None) -> tuple[Any, float]:
+    """The candidate or its shot, whichever costs less; infinite where neither cost is finite."""
+    costs = [(graph.error(candidate), candidate)]
+    if shoot is not None:
+        shot = shoot(candidate)
+        costs.append((graph.error(shot), shot))
+    cost, best = min(
+        ((c, v) for c, v in costs if np.isfinite(c)), key=lambda item: item[0], default=(np.inf, candidate)
+    )
+    return best, float(cost)
+
+
+def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
+    if damping:
+        linear = linear.clone()
+        damper = {
+            letter: (np.diag(np.sqrt(damping) / scale), np.zeros(len(scale)), gtsam.noiseModel.Unit.Create(len(scale)))
+            for letter, scale in _TRUST.items()
+        }
+        for i in range(order.size()):
+            name = order.at(i)
+            rows, zero, unit = damper[chr(gtsam.symbolChr(name))]
+            linear.push_back(gtsam.JacobianFactor(name, rows, zero, unit))
+    try:
+        return linear.optimize(order)
+    except RuntimeError:
+        return linear.optimize(order, gtsam.EliminateQR)
+
+
+def _stationary(linear: Any, order: gtsam.Ordering) -> bool:
+    """Whether the undamped step is negligible: nothing lowers the cost because it is lowest already."""
+    return bool(np.abs(_step(linear, order, 0.0).vector()).max() < 1e-4)
