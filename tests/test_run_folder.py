@@ -4,6 +4,7 @@ import csv
 import errno
 import json
 import math
+import os
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph import config, export, rerun_log
+from smartnav_graph import config, rerun_log
 from smartnav_graph.calibration import model as calibration_model
 from smartnav_graph.errors import SessionError
 from smartnav_graph.run_folder import check_out, config_differences, plain, read_run, write_run
@@ -144,11 +145,14 @@ def test_a_failed_write_leaves_the_old_run_untouched(run, tmp_path, monkeypatch,
 
 
 def test_a_full_disk_is_told_of_the_run_and_not_of_a_temporary(run, tmp_path, monkeypatch):
-    def full(*_args, **_options):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    move = os.replace
 
-    monkeypatch.setattr(export, "replacing", full)
-    monkeypatch.setattr("smartnav_graph.rerun_log.replacing", full)
+    def full(source, target):
+        if Path(target).name == "run.rrd":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(SessionError) as caught:
         write_run(run, tmp_path / "run")
     assert str(caught.value).startswith(f"{tmp_path / 'run'}: could not be written (No space left on device)")
@@ -163,7 +167,8 @@ def test_nothing_is_replaced_without_force_and_no_foreign_folder_with_it(run, tm
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "holiday.jpg").write_bytes(b"1")
     with pytest.raises(SessionError, match=r"holds no summary\.json, so it is not replaced"):
-        check_out(tmp_path / "photos", force=True)
+        write_run(run, tmp_path / "photos", force=True)
+    assert (tmp_path / "photos" / "holiday.jpg").read_bytes() == b"1"
     (tmp_path / "empty").mkdir()
     check_out(tmp_path / "empty", force=False)
 
