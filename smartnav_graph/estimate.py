@@ -91,11 +91,13 @@ def solve_passes(
     *,
     warm: Any = None,
     unsure: bool = False,
+    first_s: float = 0.0,
     progress: Progress = _silent,
 ) -> tuple[Estimate, Memory, int]:
     """Batch passes until there is nothing more to learn.
 
-    `warm` are values of an earlier solve; `unsure` says that the first state is a mere guess.
+    `warm` are values of an earlier solve; `unsure` says that the first state is a mere guess; `first_s` how long a
+    stretch it was found on.
 
     Returns
     -------
@@ -106,7 +108,7 @@ def solve_passes(
     builders = [prior, *problem.builders]
     for count in range(1, most + 1):
         progress("solve", count - 1, most)
-        smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure)
+        smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)
@@ -166,7 +168,9 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     clock.lap("prepare")
     initial = initialise(problem)
     clock.lap("initialise")
-    estimate, memory, passes = solve_passes(problem, problem.windows, initial.prior, initial.memory, progress=progress)
+    estimate, memory, passes = solve_passes(
+        problem, problem.windows, initial.prior, initial.memory, first_s=initial.stretch_s, progress=progress
+    )
     clock.lap("solve")
     _refuse_empty(problem, memory)
     return _finish(problem, initial, estimate, memory, clock, {"passes": passes})

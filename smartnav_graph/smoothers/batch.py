@@ -42,13 +42,16 @@ class BatchConfig:
 HOLD_S = 10.0
 # A settled stretch that took no more iterations than this may be longer next time.
 EASY = 6
+# Factor on the covariance that a settled stretch hands to the next: a linearised covariance is optimistic.
+ANCHOR_SLACK = 9.0
 
 
 @dataclass
 class Batch:
     """Collects steps; `estimate` solves them.
 
-    warm : values of an earlier pass, taken for every state they hold; unsure : the first state is a mere guess
+    warm : values of an earlier pass, taken for every state they hold; unsure : the first state is a mere guess;
+    first_s : stretch that the first state is known to hold for, settled as a whole
     """
 
     config: BatchConfig = field(default_factory=BatchConfig)
@@ -56,6 +59,7 @@ class Batch:
     warm: Any = None
     t0_ns: int = 0
     unsure: bool = False
+    first_s: float = 0.0
     steps: list[Step] = field(default_factory=list)
     values: Any = field(default_factory=gtsam.Values)
     _settled: int = 0
@@ -63,7 +67,7 @@ class Batch:
     _anchor: Any = None
 
     def __post_init__(self) -> None:
-        self._stretch_s = min(2.0, self.config.settle_s) if self.unsure else self.config.settle_s
+        self._stretch_s = min(2.0, self.config.settle_s) if self.unsure else max(self.config.settle_s, self.first_s)
 
     def latest(self) -> State | None:
         """Latest state: of the warm values, of the last settled stretch, or predicted since then."""
@@ -205,7 +209,7 @@ def _anchor(tree: Any, values: Any, index: int) -> Any:
     pose, velocity, bias = (key(letter, index) for letter in ("X", "V", "B"))
 
     def model(name: int) -> Any:
-        return gtsam.noiseModel.Gaussian.Covariance(tree.marginalCovariance(name))
+        return gtsam.noiseModel.Gaussian.Covariance(ANCHOR_SLACK * tree.marginalCovariance(name))
 
     graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), model(pose)))
     graph.add(gtsam.PriorFactorVector(velocity, values.atVector(velocity), model(velocity)))
