@@ -27,7 +27,7 @@ from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.export import write_trajectory_csv
 from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.frames import Origin
-from smartnav_graph.session import write_table
+from smartnav_graph.session import Session, write_table
 from smartnav_graph.solution import Residuals, Solution
 
 SUMMARY = "summary.json"
@@ -183,13 +183,27 @@ def withheld_columns(run: Run) -> dict[str, Any]:
     return {"t_ns": t_ns, "sensor": np.concatenate(names)} | errors
 
 
+def recorded(run: Run) -> Session:
+    """The session of a run with the rows kept back, as far as the run reaches, at their places again."""
+    whole: dict[str, Any] = {}
+    start, end = run.solution.t_ns[[0, -1]]
+    for name, held in run.problem.withheld.items():
+        rows = held.take((held.t_ns >= start) & (held.t_ns <= end))
+        kept = getattr(run.session, name)
+        parts = [rows.columns()] if kept is None else [kept.columns(), rows.columns()]
+        table = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+        order = np.argsort(table["t_ns"], kind="stable")
+        whole[name] = type(rows).from_columns({column: values[order] for column, values in table.items()})
+    return run.session.replace(**whole)
+
+
 def _write_views(
     run: Run, folder: Path, told: Mapping[str, Any], evaluation: Evaluation | None, report: bool, recording: bool
 ) -> None:
     from smartnav_graph.report import report_markdown, write_report
     from smartnav_graph.rerun_log import write_recording
 
-    common: dict[str, Any] = {"session": run.session, "solution": run.solution, "summary": told}
+    common: dict[str, Any] = {"session": recorded(run), "solution": run.solution, "summary": told}
     common |= {"evaluation": evaluation, "causal": run.causal}
     if recording:
         # a summary without its timings: equal runs give equal recordings

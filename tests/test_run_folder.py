@@ -17,7 +17,7 @@ import smartnav_graph as sn
 from smartnav_graph import config, rerun_log
 from smartnav_graph.calibration import model as calibration_model
 from smartnav_graph.errors import SessionError
-from smartnav_graph.run_folder import check_out, config_differences, plain, read_run, write_run
+from smartnav_graph.run_folder import check_out, config_differences, plain, read_run, recorded, write_run
 
 OPTIONS = {"end_s": 20.0, "initial": "0,0,0,0,3,30"}
 
@@ -82,6 +82,14 @@ def test_withheld_rows_give_the_figures_of_the_summary(run, tmp_path):
     assert told["count"] == len(rows["t_ns"]) == 10  # of fixes 0 ... 20 s every second one
     rms = math.sqrt(np.mean(np.square(rows["de_m"]) + np.square(rows["dn_m"])))
     assert told["rms_horizontal_m"] == pytest.approx(rms, rel=1e-12)
+
+
+def test_report_and_recording_see_the_rows_kept_back(run, session):
+    whole = recorded(run)
+    kept = np.isin(whole.gnss.t_ns, run.session.gnss.t_ns)
+    np.testing.assert_array_equal(kept, np.arange(21) % 2 == 0)  # every second one of 20 s, each at its place
+    np.testing.assert_array_equal(whole.gnss.lla, session.gnss.lla[:21])
+    np.testing.assert_array_equal(whole.gnss.sigma, session.gnss.sigma[:21])
 
 
 def test_a_replay_keeps_both_solutions(replayed, tmp_path):
