@@ -130,7 +130,7 @@ def find_gaps(
     gaps = [Gap(int(t_ns[i]), int(t_ns[i + 1]), "missing") for i in np.flatnonzero(dt > limit)]
 
     step = np.diff(values, axis=0)
-    unit = np.median(np.abs(step), axis=0)
+    unit = np.median(np.abs(step[:: max(1, len(step) // 20_000)]), axis=0)
     step /= np.where(unit > 0, unit, 1.0)
     length = np.sqrt(np.einsum("ij,ij->i", step, step))
     cosine = np.einsum("ij,ij->i", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-300)

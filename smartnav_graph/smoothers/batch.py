@@ -15,6 +15,7 @@ from smartnav_graph.smoothers.estimate import (
     Estimate,
     elimination_order,
     indeterminate,
+    insert_state,
     nav_covariances,
     state_at,
 )
@@ -65,6 +66,7 @@ class Batch:
     _settled: int = 0
     _stretch_s: float = 0.0
     _anchor: Any = None
+    _recent: Any = field(default_factory=gtsam.Values)
 
     def __post_init__(self) -> None:
         self._stretch_s = min(2.0, self.config.settle_s) if self.unsure else max(self.config.settle_s, self.first_s)
@@ -73,8 +75,7 @@ class Batch:
         """Latest state: of the warm values, of the last settled stretch, or predicted since then."""
         if not self.steps:
             return None
-        last = self.steps[-1]
-        return state_at(self.values, last.index, last.t_ns)
+        return state_at(self.values, self.steps[-1].index, self.steps[-1].t_ns)
 
     def update(self, step: Step) -> None:
         """Take one step; settle the latest stretch when it is long enough."""
@@ -82,16 +83,15 @@ class Batch:
         if self.warm is not None:
             self._take_warm(step)
             return
-        self.values.insert(step.values())
+        new = step.values()
+        self.values.insert(new)
+        self._recent.insert(new)
         since = step.t_s - self.steps[self._settled].t_s
         if since >= self._stretch_s:
             self._settle(since)
 
     def _take_warm(self, step: Step) -> None:
-        i = step.index
-        self.values.insert(key("X", i), self.warm.atPose3(key("X", i)))
-        self.values.insert(key("V", i), self.warm.atVector(key("V", i)))
-        self.values.insert(key("B", i), self.warm.atConstantBias(key("B", i)))
+        insert_state(self.values, state_at(self.warm, step.index, step.t_ns))
 
     def _settle(self, since: float) -> None:
         """Solve the steps since the last settled one, held there by its marginals.
@@ -101,29 +101,29 @@ class Batch:
         """
         stretch = self.steps[self._settled :]
         first = self._settled == 0
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph = gtsam.NonlinearFactorGraph()
         for step in stretch if first else stretch[1:]:
             for _, factor in step.factors:
                 graph.push_back(factor)
         indices = [step.index for step in stretch]
-        for i in indices:
-            values.insert(key("X", i), self.values.atPose3(key("X", i)))
-            values.insert(key("V", i), self.values.atVector(key("V", i)))
-            values.insert(key("B", i), self.values.atConstantBias(key("B", i)))
         if not first:
             graph.push_back(self._anchor)
         elif since < HOLD_S:
             graph.push_back(_hold(self.steps[0]))
         order = elimination_order(indices)
         try:
-            solve = minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate))
+            solve = minimise(graph, self._recent, order, COARSE, lambda candidate: _shot(stretch, candidate))
             if self._stretch_s >= self.config.settle_s:
-                tree = graph.linearize(solve.values).eliminateMultifrontal(order, gtsam.EliminateQR)
+                tree = _eliminate(graph.linearize(solve.values), order)
                 self._anchor = _anchor(tree, solve.values, indices[-1])
                 self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
             return  # not observable yet: a longer stretch is tried at the next step
         self.values.update(solve.values)
+        self._recent = solve.values
+        if self._settled == len(self.steps) - 1:
+            self._recent = gtsam.Values()
+            insert_state(self._recent, self.latest())
         if self._stretch_s < self.config.settle_s or solve.iterations <= EASY:
             self._stretch_s = min(2.0 * self._stretch_s, self.config.longest_settle_s)
         else:

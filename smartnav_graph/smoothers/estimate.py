@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -35,9 +36,13 @@ class Estimate:
     converged: bool
     cost: float
 
+    @cached_property
+    def _states(self) -> tuple[Floats, Floats, Floats, Floats]:
+        return states_of(self.values, self.indices)
+
     def states(self) -> tuple[Floats, Floats, Floats, Floats]:
         """nav_R_body (n, 3, 3), nav_t_body (n, 3), nav_v_body (n, 3), bias (n, 6) accelerometer then gyroscope."""
-        return states_of(self.values, self.indices)
+        return self._states
 
 
 def state_at(values: Any, index: int, t_ns: int) -> State:
@@ -46,6 +51,14 @@ def state_at(values: Any, index: int, t_ns: int) -> State:
     return State(
         index, t_ns, gtsam.NavState(pose, values.atVector(key("V", index))), values.atConstantBias(key("B", index))
     )
+
+
+def insert_state(values: Any, state: State | None) -> None:
+    """Add the three variables of one keyframe to gtsam.Values."""
+    assert state is not None
+    values.insert(key("X", state.index), state.nav.pose())
+    values.insert(key("V", state.index), state.nav.velocity())
+    values.insert(key("B", state.index), state.bias)
 
 
 def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:

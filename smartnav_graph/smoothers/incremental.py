@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
-from smartnav_graph.smoothers.estimate import Estimate, elimination_order, indeterminate, nav_covariances, to_nav_axes
+from smartnav_graph.smoothers.estimate import (
+    Estimate,
+    elimination_order,
+    indeterminate,
+    insert_state,
+    nav_covariances,
+    to_nav_axes,
+)
 
 Floats = NDArray[np.float64]
 
@@ -112,7 +119,7 @@ class Incremental:
     def _make_room(self, step: Step) -> None:
         """Keep the last estimate of the states that the coming update marginalises."""
         while self._fixed_lag and self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
-            _insert(self._left, self._state(self._inside.popleft()))
+            insert_state(self._left, self._state(self._inside.popleft()))
 
     def known(self) -> State:
         """State of the latest keyframe with its covariance."""
@@ -135,7 +142,7 @@ class Incremental:
             return self._engine.calculateBestEstimate()
         values = gtsam.Values(self._left)
         for step in self._inside:
-            _insert(values, self._state(step))
+            insert_state(values, self._state(step))
         return values
 
     def estimate(self, count: int | None = None) -> Estimate:
@@ -160,9 +167,3 @@ class Incremental:
             converged=True,
             cost=graph.error(values),
         )
-
-
-def _insert(values: Any, state: State) -> None:
-    values.insert(key("X", state.index), state.nav.pose())
-    values.insert(key("V", state.index), state.nav.velocity())
-    values.insert(key("B", state.index), state.bias)

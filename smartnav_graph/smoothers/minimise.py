@@ -85,7 +85,7 @@ def minimise(
         linear = graph.linearize(values)
         while True:
             delta = _step(linear, order, damping)
-            candidate, new_cost = _better(graph, values.retract(delta), shoot)
+            candidate, new_cost = _better(graph, values.retract(delta), cost, shoot)
             if new_cost <= cost * (1 + 1e-9) + 1e-12:
                 break
             damping = max(10.0 * damping, 1e-2)
@@ -97,16 +97,16 @@ def minimise(
     return Solve(values, cost, iterations, converged)
 
 
-def _better(graph: Any, candidate: Any, shoot: Callable[[Any], Any] | None) -> tuple[Any, float]:
-    """The candidate or its shot, whichever costs less; infinite where neither cost is finite."""
-    costs = [(graph.error(candidate), candidate)]
-    if shoot is not None:
-        shot = shoot(candidate)
-        costs.append((graph.error(shot), shot))
-    cost, best = min(
-        ((c, v) for c, v in costs if np.isfinite(c)), key=lambda item: item[0], default=(np.inf, candidate)
-    )
-    return best, float(cost)
+def _better(graph: Any, candidate: Any, cost: float, shoot: Callable[[Any], Any] | None) -> tuple[Any, float]:
+    """The candidate, or its shot where the candidate does not lower the cost; infinite where that is not finite."""
+    own = graph.error(candidate)
+    if shoot is None or own < cost:
+        return candidate, own if np.isfinite(own) else np.inf
+    shot = shoot(candidate)
+    other = graph.error(shot)
+    costs = [(c, v) for c, v in ((own, candidate), (other, shot)) if np.isfinite(c)]
+    new_cost, best = min(costs, key=lambda item: item[0], default=(np.inf, candidate))
+    return best, new_cost
 
 
 def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
