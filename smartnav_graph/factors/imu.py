@@ -26,6 +26,10 @@ from smartnav_graph.timebase import Gap, seconds_since
 Floats = NDArray[np.float64]
 
 
+# Bias steps, m/s^2 and rad/s, over which preintegration is repeated.
+STALE_BIAS = np.array([0.05] * 3 + [1e-3] * 3)
+
+
 @dataclass(frozen=True)
 class ImuConfig:
     """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging."""
@@ -57,9 +61,10 @@ def bridge_noise(imu: Imu, gaps: Sequence[Gap], length_s: float, floor: ImuNoise
     signal = np.concatenate([imu.accel, imu.gyro], axis=1)
     steps = 0.5 * (signal[1:] + signal[:-1]) * np.diff(t)[:, None]
     integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])
-    broken = np.zeros(len(t), dtype=np.int64)
+    in_gap = np.zeros(len(t), dtype=np.int64)  # of the interval that ends at each sample
     for gap in gaps:
-        broken[np.searchsorted(imu.t_ns, gap.end_ns) :] += 1
+        in_gap[np.searchsorted(imu.t_ns, gap.start_ns) + 1 : np.searchsorted(imu.t_ns, gap.end_ns) + 1] = 1
+    broken = np.cumsum(in_gap)
     least = np.array([floor.accel_noise_density] * 3 + [floor.gyro_noise_density] * 3)
     span = length_s
     while span > 2 * float(np.median(np.diff(t))):
@@ -90,6 +95,7 @@ class ImuBuilder:
     bridges: dict[int, BridgeNoise] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
+    _linearised: dict[int, Floats] = field(default_factory=dict)
 
     def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -138,12 +144,19 @@ class ImuBuilder:
         tilt = (0.5 * self.gravity * length_s**2) ** 2 * before[:3].max()
         return np.asarray(before[3:6] + length_s**2 * before[6:9] + tilt + own)
 
+    def stale(self, bias: Floats) -> bool:
+        """Whether biases (n, 6) of the keyframes have left the points the windows were preintegrated at so far that the
+        first-order correction is no longer exact."""
+        used = np.array([self._linearised[i] for i in range(len(bias) - 1)]).reshape(-1, 6)
+        return bool((np.abs(bias[:-1] - used) > STALE_BIAS).any())
+
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
             return
         i, j = window.index - 1, window.index
         pim = self.preintegrate(window, previous.bias, memory)
+        self._linearised[i] = previous.bias.vector()
         step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias
         step.foretell = pim.predict
