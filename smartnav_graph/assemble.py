@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,7 +89,7 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
         parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))
     native: dict[str, tuple[list[int], list[Floats]]] = {}
     for tag, factor in estimate.factors:
-        if tag.sensor not in positions and tag.sensor != "prior":
+        if tag.sensor not in positions and isinstance(factor, gtsam.NoiseModelFactor) and tag.sensor != "prior":
             stamps, rows = native.setdefault(tag.sensor, ([], []))
             stamps.append(tag.t_ns)
             rows.append(factor.whitenedError(estimate.values))

@@ -20,11 +20,12 @@ from smartnav_graph.assemble import Withheld, causal_solution, densify, score, t
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
+from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph import Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.problem import Problem, prepare
-from smartnav_graph.revise import revise
+from smartnav_graph.revise import position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother
 from smartnav_graph.smoothers.batch import Batch
@@ -112,7 +113,8 @@ def solve_passes(
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)
-        if done or count == most:
+        done = done and not any(isinstance(b, ImuBuilder) and b.stale(estimate.states()[3]) for b in builders)
+        if done or count == most or (unsure and (done or learnt.correlated)):
             return estimate, memory, count
         memory, warm = learnt, estimate.values
     raise AssertionError("unreachable")
@@ -134,6 +136,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         windows=problem.windows,
         imu=session.require_imu(),
         fixes=_absolute_positions(problem),
+        fix_sigma=max((float(np.median(b.sigma)) for b in position_builders(problem.builders)), default=1.0),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
@@ -223,7 +226,8 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     options = problem.config.replay
     smoother = Incremental(options, problem.session.t0_ns)
     builders = [initial.prior, *problem.builders]
-    memory = replace(initial.memory, phase="causal", rejected={})
+    wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
+    memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering)
     latency: list[float] = []
     states: list[State] = []
     interrupted = False
@@ -251,9 +255,17 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     }
     estimate, passes = before, 0
     if options.polish:
-        estimate, memory, passes = solve_passes(
-            problem, problem.windows, initial.prior, initial.memory, warm=before.values, progress=progress
-        )
+        try:
+            estimate, memory, passes = solve_passes(
+                problem,
+                problem.windows,
+                initial.prior,
+                replace(memory, phase="plain"),
+                warm=before.values,
+                progress=progress,
+            )
+        except KeyboardInterrupt:
+            extra["mode"] += ", polish interrupted"
         metres, degrees = largest_difference(before, estimate)
         extra |= {"polish": {"largest_change_m": metres, "largest_change_deg": degrees, "passes": passes}}
         clock.lap("polish")

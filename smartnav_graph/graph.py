@@ -91,6 +91,35 @@ class Tag:
     row: int = -1
 
 
+class RowModel(Protocol):
+    """Alike measurements of a kind that GTSAM lacks, linearised all at once.
+
+    letters : kinds of the states a row touches, in the order of its keys
+    """
+
+    letters: tuple[str, ...]
+
+    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
+        """Whitened residuals (m, d) and their Jacobians (m, d, n) by state, on GTSAM's tangents.
+
+        Parameters
+        ----------
+        states : one array a letter: poses (m, 4, 4), vectors (m, n)
+        data : (m, q) what each row holds
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Block:
+    """m rows of one `RowModel`: keys (m, k), data (m, q). One pass in batch, a CustomFactor a row in replay."""
+
+    sensor: str
+    model: RowModel
+    keys: Sequence[tuple[int, ...]]
+    data: Floats
+
+
 @dataclass
 class Step:
     """What one window adds to the graph.
@@ -107,11 +136,20 @@ class Step:
     variance: Floats | None = None
     foretell: Callable[[Any, Any], Any] | None = None
     factors: list[tuple[Tag, Any]] = field(default_factory=list)
-    chain: dict[int, Any] = field(default_factory=dict)
+    blocks: list[Block] = field(default_factory=list)
+    chain: dict[int, Floats] = field(default_factory=dict)
 
     def add(self, tag: Tag, factor: Any) -> None:
         """Add one native factor."""
         self.factors.append((tag, factor))
+
+    def sensors(self) -> set[str]:
+        """Names of what touches this step."""
+        return {tag.sensor for tag, _ in self.factors} | {block.sensor for block in self.blocks}
+
+    def keys(self) -> list[int]:
+        """Keys of the states this step introduces."""
+        return [key(letter, self.index) for letter in KEYFRAME_LETTERS] + list(self.chain)
 
     def values(self) -> Any:
         """Initial values of the states this step introduces (gtsam.Values)."""
@@ -130,12 +168,14 @@ class Memory:
 
     noise_scales : factor on the class-default sigma by group name
     rejected : rows not used, by sensor
+    correlated : sensors whose errors are known to wander, and get a Gauss-Markov state
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``gated`` (least squares
     without them), ``causal`` (replay: least squares, a redescending loss where a fix contradicts the prediction)
     """
 
     noise_scales: Mapping[str, float] = field(default_factory=dict)
     rejected: Mapping[str, frozenset[int]] = field(default_factory=dict)
+    correlated: frozenset[str] = frozenset()
     phase: str = "plain"
 
     def scale(self, group: str) -> float:

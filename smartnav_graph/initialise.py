@@ -193,12 +193,13 @@ Solve = Callable[[PriorBuilder, int], tuple[Estimate, Memory]]
 class Initialiser:
     """Everything `run` needs.
 
-    fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order
+    fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order; fix_sigma : their typical sigma, m
     """
 
     windows: Sequence[Window]
     imu: Imu
     fixes: tuple[NDArray[np.int64], Floats]
+    fix_sigma: float
     gravity: float
     noise: ImuNoise
     forward: str
@@ -232,10 +233,15 @@ class Initialiser:
         return self._search(solve, rest)
 
     def _moving(self, start_ns: int, length_s: float) -> bool:
-        """Whether the fixes contradict a rest."""
+        """Whether the fixes contradict a rest: a line through them with a significant slope, and the slope a walk."""
         t, p = self.fixes
         chosen = (t >= start_ns) & (t <= start_ns + int((length_s + 2.0) * NS))
-        return chosen.sum() >= 2 and bool(np.linalg.norm(p[chosen][-1] - p[chosen][0]) > 10.0)
+        if chosen.sum() < 2:
+            return False
+        x = (t[chosen] - t[chosen].mean()) / NS
+        spread = float(np.sqrt((x**2).sum()))
+        speed = float(np.linalg.norm(x @ p[chosen][:, :2]) / spread**2) if spread > 0 else 0.0
+        return speed > 0.5 and speed > 3.0 * self.fix_sigma / spread
 
     def _level(self, rest: Rest | None) -> Floats:
         """Body direction (3,) that points up: mean specific force of the rest, or of the first two seconds."""

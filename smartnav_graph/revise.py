@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from smartnav_graph.factors.gnss import PositionBuilder
-from smartnav_graph.graph import Builder, Memory, Window
+from smartnav_graph.graph import Builder, Memory, Window, key
 from smartnav_graph.smoothers.estimate import Estimate
 
 Floats = NDArray[np.float64]
@@ -56,6 +56,8 @@ def fix_residuals(
     rows = np.array([row for _, row in pairs], dtype=np.intp)
     R, p, _, _ = estimate.states()
     residual = p[keyframe] + R[keyframe] @ builder.lever - builder.position[rows]
+    if builder.name in memory.correlated:
+        residual += np.array([estimate.values.atVector(key("C", estimate.indices[k])) for k in keyframe]).reshape(-1, 3)
     posterior = np.diagonal(estimate.covariance[keyframe][:, 3:6, 3:6], axis1=1, axis2=2)
     return FixResiduals(rows, keyframe, residual, builder.scaled_sigma(memory)[rows], posterior)
 
@@ -82,11 +84,17 @@ def revise(
     if memory.phase == "gated":
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < 0.1 for name in found)
-    return new, steady and new.rejected == memory.rejected
+    done = steady and new.rejected == memory.rejected
+    wandering = frozenset(b.name for b, _ in found.values() if b.wanders(new))
+    if done and wandering != memory.correlated:
+        return replace(new, correlated=wandering), False
+    return new, done
 
 
 def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Memory:
     """Variance component of the rows without a sigma of their own; rows outside the gate do not count."""
+    if builder.name in memory.correlated:
+        return memory
     outside = _outside(builder, found, memory) | memory.rejected.get(builder.name, frozenset())
     used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
     gain = np.clip(found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from smartnav_graph.assemble import Withheld, used_counts
+from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
 from smartnav_graph.initialise import Initial
 from smartnav_graph.problem import Problem
@@ -53,10 +54,14 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
         for sensor, mask in rows.items()
     }
     count = sum(int(mask.sum()) for mask in rows.values())
-    total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
-    result = {"overall": sum(squares.values()) / total}
+    keyframes, wandering = len(estimate.indices), len(memory.correlated)
+    # a wandering error adds as many equations as states
+    total = max(count - STATE_DIM * keyframes + 12, 1)
+    result = {"overall": 2.0 * estimate.cost / total if wandering else sum(squares.values()) / total}
     left = float(total)
     for builder in position_builders(problem.builders):
+        if builder.name in memory.correlated:
+            continue
         found = fix_residuals(builder, problem.windows, estimate, memory)
         used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
         redundancy = float(np.clip(1.0 - found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0).sum())
@@ -64,7 +69,7 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
         if redundancy > 0.5:
             result[builder.name] = squares.get(builder.name, 0.0) / redundancy
     inertial = squares.get("imu", 0.0) + squares.get("imu_bias", 0.0)
-    if left > 0.5:
+    if left > 0.5 and not memory.correlated:
         result["imu"] = inertial / left
     return {name: round(value, 5) for name, value in result.items()}
 
@@ -85,6 +90,8 @@ def summarise(
     factors: dict[str, int] = {}
     for tag, _ in estimate.factors:
         factors[tag.sensor] = factors.get(tag.sensor, 0) + 1
+    for block in estimate.blocks:
+        factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, memory))
     warnings = list(problem.warnings)
     if not absolute:
@@ -136,6 +143,12 @@ def _states(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
     """Noise found on the way, beside the states of the session."""
     found = {}
     for builder in position_builders(problem.builders):
+        if builder.name in memory.correlated:
+            found[f"{builder.name}_wander_sigma_m"] = {
+                "value": [float(s) for s in wander_sigma(builder.noise)],
+                "sigma": None,
+                "held": True,
+            }
         if builder.name in memory.noise_scales:
             sigma = builder.scaled_sigma(memory)[~builder.own_sigma]
             found[f"{builder.name}_sigma_m"] = {

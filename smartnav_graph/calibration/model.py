@@ -36,10 +36,22 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class GnssNoise:
-    """Noise of position fixes that carry no sigma of their own: white part per horizontal axis and height, metres."""
+    """Noise of position fixes, metres.
+
+    horizontal_sigma, vertical_sigma : white part of fixes that carry no sigma of their own
+    correlated_horizontal_sigma, correlated_vertical_sigma, correlated_time : first-order Gauss-Markov part of code
+    receivers, m and s; zero sigma for a receiver whose errors do not wander
+    """
 
     horizontal_sigma: float = 3.0
     vertical_sigma: float = 5.0
+    correlated_horizontal_sigma: float = 4.0
+    correlated_vertical_sigma: float = 6.0
+    correlated_time: float = 60.0
+
+    @property
+    def wanders(self) -> bool:
+        return self.correlated_horizontal_sigma > 0 and self.correlated_vertical_sigma > 0
 
 
 # One default a device class, the same for every recording.
@@ -70,7 +82,8 @@ class Calibration:
         for room in (self.imu_noise, self.gnss_noise):
             for f in dataclasses.fields(room):
                 value = getattr(room, f.name)
-                if not (math.isfinite(value) and value > 0):
+                may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
+                if not (math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
                     raise CalibrationError(
                         "calibration.toml", f"{f.name} = {value}", "a finite number > 0", "give SI units"
                     )

@@ -44,7 +44,7 @@ def _control(context: FactorContext) -> Builder | None:
     if stream is None:
         return None
     sigma = context.control.default_sigma
-    config = replace(context.gnss, estimate_sigma=False)
+    config = replace(context.gnss, estimate_sigma=False, correlated=False)
     return PositionBuilder.of(context.session, "control", stream, GnssNoise(sigma, sigma), config)
 
 

@@ -11,11 +11,15 @@ from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
+from smartnav_graph.factors import correlated
+from smartnav_graph.factors.correlated import add_wander, wander_sigma
+from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Positioned
 
 Floats = NDArray[np.float64]
+
+LEAST_WANDERING_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
@@ -27,11 +31,12 @@ CAUSAL_TAIL = 9.0
 class GnssConfig:
     """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``huber`` or
     ``none``; gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes
-    that carry none from the kept data."""
+    that carry none from the kept data; correlated : give the wandering error of code receivers a state."""
 
     loss: str = "gate"
     gate_probability: float = 0.999
     estimate_sigma: bool = True
+    correlated: bool = True
 
     def __post_init__(self) -> None:
         if self.loss not in ("gate", "huber", "none"):
@@ -74,6 +79,7 @@ class PositionBuilder:
     own_sigma: NDArray[np.bool_]
     lever: Floats
     config: GnssConfig = field(default_factory=GnssConfig)
+    noise: GnssNoise = field(default_factory=GnssNoise)
 
     @classmethod
     def of(
@@ -83,7 +89,13 @@ class PositionBuilder:
         given = np.full((len(stream), 3), np.nan) if stream.sigma is None else stream.sigma
         own = np.asarray(np.isfinite(given).all(axis=1))
         lever = np.asarray(session.mount(name).body_t, dtype=np.float64)
-        return cls(name, session.nav_position(stream), fix_sigmas(stream, noise), own, lever, config)
+        return cls(name, session.nav_position(stream), fix_sigmas(stream, noise), own, lever, config, noise)
+
+    def wanders(self, memory: Memory) -> bool:
+        """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
+        `LEAST_WANDERING_SIGMA`. Better ones come from carrier phase, whose errors do not wander by metres."""
+        typical = float(np.median(self.scaled_sigma(memory)[:, :2]))
+        return self.noise.wanders and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
 
     def scaled_sigma(self, memory: Memory) -> Floats:
         """Sigmas (n, 3) m after the noise scale of this sensor."""
@@ -107,23 +119,34 @@ class PositionBuilder:
         if memory.phase != "causal" or step.variance is None:
             return "cauchy" if memory.phase == "robust" else "none"
         foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever
-        square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance)).sum()
+        wander = wander_sigma(self.noise) ** 2 if self.name in memory.correlated else 0.0
+        square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum()
         return "cauchy" if self.gate(np.array([square]), CAUSAL_TAIL, np.array([row]))[0] else "none"
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """A factor for every row of this stream at the keyframe."""
+        wanders = self.name in memory.correlated
+        if wanders:
+            add_wander(step, window, previous, self.noise)
         rows = window.rows.get(self.name, ())
-        if len(rows) == 0:
-            return
-        scale = memory.scale(self.name)
-        pose = key("X", window.index)
-        for row in rows:
+        sigmas = self.scaled_sigma(memory)[rows] if len(rows) else ()
+        for row, sigma in zip(rows, sigmas, strict=True):
             if memory.is_rejected(self.name, int(row)):
                 continue
-            sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else scale)
-            model = noise_model(sigma, self._loss_of(int(row), sigma, step, memory))
-            tag = Tag(self.name, window.t1_ns, int(row))
-            if self.lever.any():
-                step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever, model))
+            loss = self._loss_of(int(row), sigma, step, memory)
+            if wanders and loss == "none":
+                self._add_wandering(step, int(row), sigma)
             else:
-                step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
+                self._add_native(step, int(row), noise_model(sigma, loss))
+
+    def _add_native(self, step: Step, row: int, model: gtsam.noiseModel.Base) -> None:
+        pose, tag = key("X", step.index), Tag(self.name, step.t_ns, row)
+        if self.lever.any():
+            step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever, model))
+        else:
+            step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
+
+    def _add_wandering(self, step: Step, row: int, sigma: Floats) -> None:
+        keys = (key("X", step.index), key("C", step.index))
+        data = np.concatenate([self.position[row], self.lever, sigma])[None]
+        step.blocks.append(Block(self.name, correlated.MODEL, [keys], data))

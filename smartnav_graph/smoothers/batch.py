@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,16 +11,17 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import State, Step, key
+from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
 from smartnav_graph.smoothers.estimate import (
     Estimate,
+    copy_state,
     elimination_order,
     indeterminate,
-    insert_state,
     nav_covariances,
     state_at,
 )
 from smartnav_graph.smoothers.minimise import COARSE, SolveConfig, minimise
+from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Batch:
     values: Any = field(default_factory=gtsam.Values)
     _settled: int = 0
     _stretch_s: float = 0.0
+    _settle_s: float = 0.0
     _anchor: Any = None
     _recent: Any = field(default_factory=gtsam.Values)
 
@@ -88,10 +91,12 @@ class Batch:
         self._recent.insert(new)
         since = step.t_s - self.steps[self._settled].t_s
         if since >= self._stretch_s:
+            begin = time.perf_counter()
             self._settle(since)
+            self._settle_s += time.perf_counter() - begin
 
     def _take_warm(self, step: Step) -> None:
-        insert_state(self.values, state_at(self.warm, step.index, step.t_ns))
+        copy_state(step, self.warm, self.values)
 
     def _settle(self, since: float) -> None:
         """Solve the steps since the last settled one, held there by its marginals.
@@ -101,21 +106,17 @@ class Batch:
         """
         stretch = self.steps[self._settled :]
         first = self._settled == 0
-        graph = gtsam.NonlinearFactorGraph()
-        for step in stretch if first else stretch[1:]:
-            for _, factor in step.factors:
-                graph.push_back(factor)
-        indices = [step.index for step in stretch]
+        graph = WholeGraph(stretch if first else stretch[1:])
         if not first:
-            graph.push_back(self._anchor)
+            graph.native.push_back(self._anchor)
         elif since < HOLD_S:
-            graph.push_back(_hold(self.steps[0]))
-        order = elimination_order(indices)
+            graph.native.push_back(_hold(self.steps[0]))
+        order = elimination_order(stretch)
         try:
             solve = minimise(graph, self._recent, order, COARSE, lambda candidate: _shot(stretch, candidate))
             if self._stretch_s >= self.config.settle_s:
                 tree = _eliminate(graph.linearize(solve.values), order)
-                self._anchor = _anchor(tree, solve.values, indices[-1])
+                self._anchor = _anchor(tree, solve.values, stretch[-1])
                 self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
             return  # not observable yet: a longer stretch is tried at the next step
@@ -123,7 +124,7 @@ class Batch:
         self._recent = solve.values
         if self._settled == len(self.steps) - 1:
             self._recent = gtsam.Values()
-            insert_state(self._recent, self.latest())
+            copy_state(self.steps[-1], self.values, self._recent)
         if self._stretch_s < self.config.settle_s or solve.iterations <= EASY:
             self._stretch_s = min(2.0 * self._stretch_s, self.config.longest_settle_s)
         else:
@@ -131,14 +132,6 @@ class Batch:
 
     def _shoot(self, candidate: Any) -> Any:
         return _shot(self.steps, candidate)
-
-    def graph(self) -> Any:
-        """All factors taken so far."""
-        graph = gtsam.NonlinearFactorGraph()
-        for step in self.steps:
-            for _, factor in step.factors:
-                graph.push_back(factor)
-        return graph
 
     def estimate(self) -> Estimate:
         """Solve everything.
@@ -148,10 +141,12 @@ class Batch:
         SolverError
             Not observable, not finite or not converged; names time, state and sensors.
         """
-        graph, indices = self.graph(), [step.index for step in self.steps]
-        order = elimination_order(indices)
+        graph, indices = WholeGraph(self.steps), [step.index for step in self.steps]
+        order = elimination_order(self.steps)
+        begin = time.perf_counter()
         try:
             solve = minimise(graph, self.values, order, self.solve, self._shoot if self.unsure else None)
+            solved = time.perf_counter()
             tree = _eliminate(graph.linearize(solve.values), order)
             covariance = nav_covariances(tree, solve.values, indices)
         except RuntimeError as error:
@@ -164,14 +159,20 @@ class Batch:
             t_ns=np.array([step.t_ns for step in self.steps], dtype=np.int64),
             covariance=covariance,
             factors=[item for step in self.steps for item in step.factors],
+            blocks=[block for step in self.steps for block in step.blocks],
             iterations=solve.iterations,
             converged=solve.converged,
             cost=solve.cost,
+            seconds={
+                "solve": self._settle_s + solved - begin,
+                "covariance": time.perf_counter() - solved,
+                "settle": self._settle_s,
+            },
         )
 
     def _explain(self, error: RuntimeError) -> SolverError:
         t_ns = {step.index: step.t_ns for step in self.steps}
-        touching = {step.index: {tag.sensor for tag, _ in step.factors} for step in self.steps}
+        touching = {step.index: step.sensors() for step in self.steps}
         return indeterminate(error, t_ns, self.t0_ns, touching)
 
 
@@ -203,17 +204,18 @@ def _eliminate(linear: Any, order: gtsam.Ordering) -> Any:
         return linear.eliminateMultifrontal(order, gtsam.EliminateQR)
 
 
-def _anchor(tree: Any, values: Any, index: int) -> Any:
-    """Prior factors that stand for everything before keyframe `index`."""
+def _anchor(tree: Any, values: Any, step: Step) -> Any:
+    """Prior factors that stand for everything up to `step`."""
     graph = gtsam.NonlinearFactorGraph()
-    pose, velocity, bias = (key(letter, index) for letter in ("X", "V", "B"))
+    pose, velocity, bias = (key(letter, step.index) for letter in KEYFRAME_LETTERS)
 
     def model(name: int) -> Any:
         return gtsam.noiseModel.Gaussian.Covariance(ANCHOR_SLACK * tree.marginalCovariance(name))
 
     graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), model(pose)))
-    graph.add(gtsam.PriorFactorVector(velocity, values.atVector(velocity), model(velocity)))
     graph.add(gtsam.PriorFactorConstantBias(bias, values.atConstantBias(bias), model(bias)))
+    for name in (velocity, *step.chain):
+        graph.add(gtsam.PriorFactorVector(name, values.atVector(name), model(name)))
     return graph
 
 
@@ -229,7 +231,7 @@ def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None
     bad = ~np.isfinite(variances).all(axis=1) | (variances <= 0).any(axis=1) | (variances[:, 3:6] > 1e12).any(axis=1)
     if bad.any():
         step = steps[int(np.flatnonzero(bad)[0])]
-        sensors = ", ".join(sorted({tag.sensor for tag, _ in step.factors})) or "nothing"
+        sensors = ", ".join(sorted(step.sensors())) or "nothing"
         raise SolverError(
             f"t = {(step.t_ns - t0_ns) / 1e9:.2f} s",
             f"position or attitude is not determined there (keyframe {step.index}, touched by {sensors})",

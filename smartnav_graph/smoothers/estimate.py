@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, State, Tag, key, nested_order
+from smartnav_graph.graph import KEYFRAME_LETTERS, Block, State, Step, Tag, key, nested_order
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,8 @@ class Estimate:
 
     values : gtsam.Values at the solution; indices, t_ns : keyframes, in time order
     covariance : (n, 15, 15) rotation, position, velocity (nav axes), accelerometer and gyroscope bias (body axes)
-    factors : every factor with its tag; iterations, converged, cost : of the last solve
+    factors, blocks : every native factor with its tag, and every block; iterations, converged, cost : of the last solve
+    seconds : wall time by stage
     """
 
     values: Any
@@ -32,9 +33,11 @@ class Estimate:
     t_ns: NDArray[np.int64]
     covariance: Floats
     factors: Sequence[tuple[Tag, Any]]
+    blocks: Sequence[Block]
     iterations: int
     converged: bool
     cost: float
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def _states(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -53,12 +56,14 @@ def state_at(values: Any, index: int, t_ns: int) -> State:
     )
 
 
-def insert_state(values: Any, state: State | None) -> None:
-    """Add the three variables of one keyframe to gtsam.Values."""
-    assert state is not None
-    values.insert(key("X", state.index), state.nav.pose())
-    values.insert(key("V", state.index), state.nav.velocity())
-    values.insert(key("B", state.index), state.bias)
+def copy_state(step: Step, source: Any, target: Any) -> None:
+    """Copy the variables of one step from gtsam.Values to gtsam.Values."""
+    x, v, b = (key(letter, step.index) for letter in KEYFRAME_LETTERS)
+    target.insert(x, source.atPose3(x))
+    target.insert(v, source.atVector(v))
+    target.insert(b, source.atConstantBias(b))
+    for name, initial in step.chain.items():
+        target.insert(name, source.atVector(name) if source.exists(name) else initial)
 
 
 def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
@@ -79,14 +84,12 @@ def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
     return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
 
 
-def elimination_order(indices: Sequence[int], extra: Iterable[int] = ()) -> gtsam.Ordering:
-    """Chain states at once with their keyframe, keyframes by nested dissection, session states last."""
+def elimination_order(steps: Sequence[Step]) -> gtsam.Ordering:
+    """Keyframes by nested dissection of time, each with all the states of its step."""
     order = gtsam.Ordering()
-    for index in nested_order(indices):
-        for letter in KEYFRAME_LETTERS:
-            order.push_back(key(letter, index))
-    for name in extra:
-        order.push_back(name)
+    for row in nested_order(range(len(steps))):
+        for name in steps[row].keys():  # noqa: SIM118 (a method, not a dict)
+            order.push_back(name)
     return order
 
 

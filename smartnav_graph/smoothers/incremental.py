@@ -14,15 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
-from smartnav_graph.smoothers.estimate import (
-    Estimate,
-    elimination_order,
-    indeterminate,
-    insert_state,
-    nav_covariances,
-    to_nav_axes,
-)
+from smartnav_graph.graph import State, Step, key
+from smartnav_graph.smoothers.estimate import Estimate, elimination_order, indeterminate, nav_covariances, to_nav_axes
+from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
 
 Floats = NDArray[np.float64]
 
@@ -102,16 +96,19 @@ class Incremental:
         graph = gtsam.NonlinearFactorGraph()
         for _, factor in step.factors:
             graph.push_back(factor)
+        for block in step.blocks:
+            for row in range(len(block.keys)):
+                graph.push_back(custom_factor(block, row))
         self._make_room(step)
         try:
             if self._fixed_lag:
-                stamps = {key(letter, step.index): step.t_s for letter in KEYFRAME_LETTERS}
+                stamps = dict.fromkeys(step.keys(), step.t_s)
                 self._engine.update(graph, step.values(), stamps)
             else:
                 self._engine.update(graph, step.values())
         except RuntimeError as error:
             t_ns = {s.index: s.t_ns for s in [*self.steps, step]}
-            touching = {s.index: {tag.sensor for tag, _ in s.factors} for s in [*self.steps, step]}
+            touching = {s.index: s.sensors() for s in [*self.steps, step]}
             raise indeterminate(error, t_ns, self.t0_ns, touching) from error
         self.steps.append(step)
         self._inside.append(step)
@@ -119,7 +116,16 @@ class Incremental:
     def _make_room(self, step: Step) -> None:
         """Keep the last estimate of the states that the coming update marginalises."""
         while self._fixed_lag and self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
-            insert_state(self._left, self._state(self._inside.popleft()))
+            self._keep(self._inside.popleft(), self._left)
+
+    def _keep(self, step: Step, values: Any) -> None:
+        """Copy the present estimate of a step's variables."""
+        state = self._state(step)
+        values.insert(key("X", step.index), state.nav.pose())
+        values.insert(key("V", step.index), state.nav.velocity())
+        values.insert(key("B", step.index), state.bias)
+        for name in step.chain:
+            values.insert(name, self._engine.calculateEstimateVector(name))
 
     def known(self) -> State:
         """State of the latest keyframe with its covariance."""
@@ -142,7 +148,7 @@ class Incremental:
             return self._engine.calculateBestEstimate()
         values = gtsam.Values(self._left)
         for step in self._inside:
-            insert_state(values, self._state(step))
+            self._keep(step, values)
         return values
 
     def estimate(self, count: int | None = None) -> Estimate:
@@ -151,18 +157,15 @@ class Incremental:
         steps = self.steps[:count]
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
-        graph = gtsam.NonlinearFactorGraph()
-        for step in steps:
-            for _, factor in step.factors:
-                graph.push_back(factor)
-        values, indices = self.values(), [step.index for step in steps]
-        tree = graph.linearize(values).eliminateMultifrontal(elimination_order(indices), gtsam.EliminateQR)
+        graph, values, indices = WholeGraph(steps), self.values(), [step.index for step in steps]
+        tree = graph.linearize(values).eliminateMultifrontal(elimination_order(steps), gtsam.EliminateQR)
         return Estimate(
             values=values,
             indices=indices,
             t_ns=np.array([step.t_ns for step in steps], dtype=np.int64),
             covariance=nav_covariances(tree, values, indices),
             factors=[item for step in steps for item in step.factors],
+            blocks=[block for step in steps for block in step.blocks],
             iterations=len(steps),
             converged=True,
             cost=graph.error(values),

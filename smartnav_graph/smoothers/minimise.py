@@ -32,6 +32,9 @@ class SolveConfig:
             raise ConfigError("config [solve]", "a value <= 0", "> 0")
 
 
+# Iterations in a row that no longer lower the cost end the search even where a state that nothing holds still moves.
+FLAT = 3
+
 # Enough to go on from: a later solve finishes the work.
 COARSE = SolveConfig(max_iterations=40, tolerance=1e-3, step_tolerance=1.0)
 FIRST = SolveConfig(max_iterations=40, tolerance=1e-4, step_tolerance=1e-2)
@@ -79,7 +82,7 @@ def minimise(
     if not np.isfinite(cost):
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
     trust = np.concatenate([_TRUST[chr(gtsam.symbolChr(name))] for name in list(values.keys())])
-    damping, iterations, converged = 0.0, 0, False
+    damping, iterations, converged, flat = 0.0, 0, False, 0
     while iterations < config.max_iterations and not converged:
         iterations += 1
         linear = graph.linearize(values)
@@ -92,7 +95,8 @@ def minimise(
             if damping > 1e10:
                 return Solve(values, cost, iterations, _stationary(linear, order))
         small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
-        converged = damping <= 1.0 and small and cost - new_cost <= config.tolerance * max(new_cost, 1.0)
+        flat = flat + 1 if cost - new_cost <= config.tolerance * max(new_cost, 1.0) else 0
+        converged = damping <= 1.0 and flat > 0 and (small or flat >= FLAT)
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
     return Solve(values, cost, iterations, converged)
 
