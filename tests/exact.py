@@ -1,0 +1,182 @@
+"""An exact recording of a known motion, and the graph that the package makes of it.
+
+Readings are without noise, local frame, gravity 9.81 m/s^2. Fixes stand between inertial samples, so that borders of
+windows are interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
+from smartnav_graph.factors.control import ControlConfig
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.imu import ImuConfig
+from smartnav_graph.graph import Memory, State, Tag, Window, build_step, key
+from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
+from smartnav_graph.prediction import Kinematics
+from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.simulation import motions, sensors
+from smartnav_graph.simulation.sensors import Biases
+from smartnav_graph.simulation.trajectory import Trajectory, Truth
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.streams import ControlPoint, GnssFix
+from smartnav_graph.timebase import NS, Gap, ns_from_seconds
+
+GRAVITY = 9.81
+START_NS = 1_000 * NS
+LEVER = (0.1, -0.6, 0.9)  # m, body axes
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A session and the motion it was made of."""
+
+    session: Session
+    trajectory: Trajectory
+    biases: Biases
+
+    def truth(self, t_ns: Any) -> Truth:
+        """Exact states at these stamps."""
+        return self.trajectory.sample((np.asarray(t_ns) - START_NS) / NS)
+
+    def bias(self, t_ns: Any) -> np.ndarray:
+        """True biases (n, 6), accelerometer then gyroscope, at these stamps."""
+        at = self.session.imu.t_ns
+        rows = np.concatenate([self.biases.accel, self.biases.gyro], axis=1)
+        return np.stack([np.interp(np.asarray(t_ns) - START_NS, at - START_NS, column) for column in rows.T], axis=-1)
+
+
+def eight(seconds: float = 30.0) -> Trajectory:
+    """A phone carried round a figure eight after 5 s of rest."""
+    return motions.figure_eight(seconds)
+
+
+def record(
+    trajectory: Trajectory | None = None,
+    *,
+    hertz: float = 100.0,
+    every_s: float = 1.0,
+    noise: Any = None,
+    fix_sigma: float = 1.0,
+    seed: int | None = None,
+) -> Recording:
+    """A session of `trajectory`; `noise` (ImuNoise) and a `seed` make it noisy."""
+    trajectory = trajectory or eight()
+    t = np.arange(round(trajectory.duration * hertz) + 1) / hertz
+    t_ns = START_NS + ns_from_seconds(t)
+    rng = np.random.default_rng(seed)
+    imu, biases = sensors.imu(trajectory.sample(t), t_ns, noise, GRAVITY, rng)
+    at = np.arange(0.5037, trajectory.duration, every_s)
+    streams = {}
+    for name, times in (("gnss", at), ("control", at[2::5] + 0.25)):
+        times = times[times < trajectory.duration]
+        there = trajectory.sample(times)
+        enu = there.nav_t_body + there.nav_R_body @ np.array(LEVER)
+        if seed is not None:
+            enu = enu + fix_sigma * rng.standard_normal(enu.shape)
+        rows = {"t_ns": START_NS + ns_from_seconds(times), "enu": enu, "sigma": np.full(enu.shape, fix_sigma)}
+        points = {"point_id": np.array([f"P{i}" for i in range(len(times))], dtype=object)}
+        streams[name] = GnssFix(**rows) if name == "gnss" else ControlPoint(**rows, **points)
+    session = Session(
+        device=Device(name="exact"),
+        gravity_m_s2=GRAVITY,
+        sensors={name: Mount(body_t=LEVER) for name in streams},
+        calibration=None if noise is None else Calibration(imu_noise=noise),
+        imu=imu,
+        **streams,
+    )
+    return Recording(session, trajectory, biases)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Windows, builders by name, and the factors of every step at given states."""
+
+    windows: Sequence[Window]
+    builders: dict[str, Any]
+    steps: Sequence[Any]
+    values: Any
+
+    def factors(self, *sensors: str) -> list[tuple[Tag, Any]]:
+        """Tagged factors of these sensors."""
+        return [item for step in self.steps for item in step.factors if item[0].sensor in sensors]
+
+
+def assemble(
+    session: Session,
+    truth: Callable[[Any], Truth],
+    *,
+    bias: Callable[[Any], np.ndarray] = lambda t: np.zeros((len(t), 6)),
+    gaps: Sequence[Gap] = (),
+    memory: Memory | None = None,
+    keyframes: KeyframeConfig | None = None,
+    span: tuple[int, int] | None = None,
+) -> Graph:
+    """The graph of `session` with every step built at the states that `truth` and `bias` tell."""
+    keyframes = keyframes or KeyframeConfig()
+    imu = session.require_imu()
+    span = span or (int(imu.t_ns[0]), int(imu.t_ns[-1]))
+    aiding = {name: s.t_ns for name in ABSOLUTE if (s := getattr(session, name)) is not None}
+    times = keyframe_times(span, list(aiding.values()), gaps, keyframes)
+    windows = make_windows(imu, times, gaps, aiding, keyframes)
+    context = FactorContext(
+        session, session.calibration or Calibration(), gaps, ImuConfig(), GnssConfig(loss="none"), ControlConfig()
+    )
+    made = {name: make(context) for name, make in BUILDERS.items()}
+    builders = {name: builder for name, builder in made.items() if builder is not None}
+    there, biases = truth(times), bias(times)
+    states = [state(there, k, int(t), biases[k]) for k, t in enumerate(times)]
+    steps = [
+        build_step(w, states[k - 1] if k else None, builders.values(), memory or Memory(), int(times[0]))
+        for k, w in enumerate(windows)
+    ]
+    return Graph(windows, builders, steps, values_of(states))
+
+
+def state(truth: Truth, row: int, t_ns: int, bias: np.ndarray) -> State:
+    """One row of the truth as a state of the graph."""
+    pose = gtsam.Pose3(gtsam.Rot3(truth.nav_R_body[row]), truth.nav_t_body[row])
+    return State(row, t_ns, gtsam.NavState(pose, truth.nav_v_body[row]), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+
+
+def values_of(states: Sequence[State]) -> Any:
+    """gtsam.Values of these states."""
+    values = gtsam.Values()
+    for s in states:
+        values.insert(key("X", s.index), s.nav.pose())
+        values.insert(key("V", s.index), s.nav.velocity())
+        values.insert(key("B", s.index), s.bias)
+    return values
+
+
+def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
+    """An estimate that stands at the graph's own values."""
+    n = len(graph.windows)
+    return Estimate(
+        values=graph.values,
+        indices=range(n),
+        t_ns=np.array([w.t1_ns for w in graph.windows], dtype=np.int64),
+        covariance=np.zeros((n, 15, 15)) if covariance is None else covariance,
+        factors=[item for step in graph.steps for item in step.factors],
+        iterations=1,
+        converged=True,
+        cost=0.0,
+    )
+
+
+def kinematics(truth: Truth) -> Kinematics:
+    """The truth as smoothed states without bias."""
+    return Kinematics(truth.nav_R_body, truth.nav_t_body, truth.nav_v_body, np.zeros((len(truth), 6)))
+
+
+def angle_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Rotation angle (n,) between attitudes (n, 3, 3), degrees; exact near zero."""
+    sine = np.linalg.norm(one - other, axis=(-2, -1)) / np.sqrt(8.0)
+    return np.degrees(2.0 * np.arcsin(np.clip(sine, 0.0, 1.0)))

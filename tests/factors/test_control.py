@@ -1,0 +1,60 @@
+"""Surveyed points: position factors of their own sensor, with their own default sigma."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from exact import LEVER, assemble, record
+
+from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors import BUILDERS, FactorContext
+from smartnav_graph.factors.control import ControlConfig
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.imu import ImuConfig
+from smartnav_graph.graph import Memory
+from smartnav_graph.streams import ControlPoint
+
+
+def made(session, **config):
+    context = FactorContext(session, Calibration(), (), ImuConfig(), GnssConfig(), ControlConfig(**config))
+    return BUILDERS["control"](context)
+
+
+def points(**sigma) -> ControlPoint:
+    return ControlPoint(t_ns=[0, 1], enu=np.eye(3)[:2], point_id=["A", "B"], **sigma)
+
+
+def test_points_without_sigma_take_the_default_of_the_room():
+    session = record().session.replace(control=points())
+    np.testing.assert_array_equal(made(session).sigma, 0.05)
+    np.testing.assert_array_equal(made(session, default_sigma=0.2).sigma, 0.2)
+
+
+def test_a_points_own_sigma_and_lever_arm_are_used():
+    session = record().session.replace(control=points(sigma=np.full((2, 3), 0.01)))
+    control = made(session)
+    np.testing.assert_array_equal(control.sigma, 0.01)
+    np.testing.assert_array_equal(control.lever, LEVER)
+    assert control.own_sigma.all() and control.name == "control"
+
+
+def test_the_sigma_of_surveyed_points_is_never_estimated():
+    assert made(record().session).config.estimate_sigma is False
+
+
+def test_control_and_fixes_are_rejected_apart():
+    recording = record()
+    both = assemble(recording.session, recording.truth, memory=Memory(rejected={"control": frozenset({0})}))
+    assert [tag.row for tag, _ in both.factors("control")] == list(range(1, len(recording.session.control)))
+    assert len(both.factors("gnss")) == len(recording.session.gnss)
+
+
+def test_without_points_there_is_no_builder():
+    assert made(record().session.replace(control=None)) is None
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan")])
+def test_config_refuses_a_sigma_that_is_not_positive(sigma):
+    with pytest.raises(ConfigError, match=r"config \[control\]: default_sigma = .*; expected > 0 m"):
+        ControlConfig(sigma)
