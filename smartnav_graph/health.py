@@ -164,6 +164,8 @@ def quiet_accel(imu: Imu) -> float | None:
     """
     every = max(1, round(0.02 / _period(imu)))  # 50 Hz is enough to see a step
     imu = imu.take(slice(None, None, every)) if every > 1 else imu
+    if len(imu) < 6:
+        return None
     width = max(3, round(0.5 / _period(imu)))
     if len(imu) < 2 * width:
         return None

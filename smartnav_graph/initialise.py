@@ -380,8 +380,9 @@ class Initialiser:
         starts: list[State] = []
         p0, v0 = fixes[0], np.zeros(3)
         up = self._level(rest)
-        if len(t_ns) >= 2 and rest is None:
-            v0 = (fixes[1] - fixes[0]) / (t[1] - t[0])
+        later = np.flatnonzero(t > t[0])  # two sensors may share the first epoch
+        if len(later) and rest is None:
+            v0 = (fixes[later[0]] - fixes[0]) / (t[later[0]] - t[0])
             p0 = fixes[0] - v0 * t[0]
         curve = inertial_curve(windows, bias)[np.minimum(np.searchsorted(ends, t_ns), count - 1)]
         for length in KABSCH_S:  # the shorter curve suffers less from an unknown gyro bias, the longer from noise

@@ -99,7 +99,7 @@ def summarise(
             "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
         )
     if not estimate.converged:
-        warnings.append("solve: the iteration limit was reached before the cost settled; raise batch.max_iterations")
+        warnings.append("solve: the iteration limit was reached before the cost settled; raise solve.max_iterations")
     summary: dict[str, Any] = {
         "mode": "batch" if absolute else "dead-reckoning",
         "vehicle": problem.vehicle,
