@@ -95,7 +95,13 @@ def _gravity() -> float:
 
 def _calibration(scenario: Scenario) -> Calibration:
     profile, model = PROFILES[scenario.profile], scenario.gnss or GnssModel()
-    gnss = GnssNoise(horizontal_sigma=model.white_m, vertical_sigma=1.5 * model.white_m)
+    gnss = GnssNoise(
+        horizontal_sigma=model.white_m,
+        vertical_sigma=1.5 * model.white_m,
+        correlated_horizontal_sigma=model.markov_m,
+        correlated_vertical_sigma=1.5 * model.markov_m,
+        correlated_time=model.markov_s,
+    )
     return Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
 
 
@@ -161,13 +167,13 @@ _CAR_GNSS = GnssModel(white_m=3.0, body_t_antenna=(0.1, -0.6, 0.9))
 SCENARIOS: dict[str, Scenario] = {
     s.name: s
     for s in (
-        Scenario("walk-60s", 60.0, motions.walk, "foot", gnss=GnssModel(), phone_sensors=True),
-        Scenario("walk-10min", 600.0, motions.walk, "foot", gnss=GnssModel(), phone_sensors=True),
+        Scenario("walk-60s", 60.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
+        Scenario("walk-10min", 600.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
         Scenario("car-10min", 600.0, motions.car, "car", gnss=_CAR_GNSS),
         Scenario("car-37min", 2220.0, motions.car, "car", gnss=_CAR_GNSS),
         Scenario("car-2h", 7200.0, motions.car, "car", gnss=_CAR_GNSS),
-        Scenario("trolley-loop", 384.0, _trolley, "trolley", control=True),
-        Scenario("static-60s", 60.0, _static_motion, gnss=GnssModel(), phone_sensors=True),
+        Scenario("trolley-loop", 384.0, _trolley, "trolley", "galaxy-s2", control=True),
+        Scenario("static-60s", 60.0, _static_motion, "none", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
         Scenario("figure-eight-60s", 60.0, _eight, gnss=GnssModel(white_m=1.0)),
         Scenario("phone-car-5min", 300.0, _moving_car, "car", "galaxy-s2", gnss=_PHONE_GNSS),
     )
