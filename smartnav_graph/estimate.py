@@ -113,10 +113,10 @@ def solve_passes(
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)
-        done = done and not any(isinstance(b, ImuBuilder) and b.stale(estimate.states()[3]) for b in builders)
-        if done or count == most or (unsure and (done or learnt.correlated)):
+        stale = any(isinstance(b, ImuBuilder) and b.stale(estimate.states()[3]) for b in builders)
+        if (done and not stale) or count == most or (unsure and (done or learnt.correlated)):
             return estimate, memory, count
-        memory, warm = learnt, estimate.values
+        memory, warm = memory if done else learnt, estimate.values
     raise AssertionError("unreachable")
 
 

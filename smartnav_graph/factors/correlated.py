@@ -64,12 +64,16 @@ def add_wander(step: Step, window: Window, previous: State | None, noise: GnssNo
         return
     phi = float(np.exp(-window.length_s / noise.correlated_time))
     driving = 1.0 / (sigma * np.sqrt(1.0 - phi**2))
+    before = key("C", window.index - 1)
     linear = gtsam.JacobianFactor(
-        key("C", window.index - 1),
+        before,
         np.diag(-phi * driving),
         name,
         np.diag(driving),
         np.zeros(3),
         gtsam.noiseModel.Unit.Create(3),
     )
-    step.add(tag, gtsam.LinearContainerFactor(linear))
+    origin = gtsam.Values()  # without a linearisation point GTSAM counts the factor as zero cost
+    origin.insert(before, np.zeros(3))
+    origin.insert(name, np.zeros(3))
+    step.add(tag, gtsam.LinearContainerFactor(linear, origin))
