@@ -165,6 +165,7 @@ def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
         t_ns=np.array([w.t1_ns for w in graph.windows], dtype=np.int64),
         covariance=np.zeros((n, 15, 15)) if covariance is None else covariance,
         factors=[item for step in graph.steps for item in step.factors],
+        blocks=[],
         iterations=1,
         converged=True,
         cost=0.0,
