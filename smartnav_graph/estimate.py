@@ -20,7 +20,6 @@ from smartnav_graph.assemble import Withheld, causal_solution, densify, score, t
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
-from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph import Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
@@ -113,10 +112,9 @@ def solve_passes(
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
         learnt, done = revise(problem.builders, windows, estimate, memory)
-        stale = any(isinstance(b, ImuBuilder) and b.stale(estimate.states()[3]) for b in builders)
-        if (done and not stale) or count == most or (unsure and (done or learnt.correlated)):
+        if done or count == most or (unsure and learnt.correlated):
             return estimate, memory, count
-        memory, warm = memory if done else learnt, estimate.values
+        memory, warm = learnt, estimate.values
     raise AssertionError("unreachable")
 
 

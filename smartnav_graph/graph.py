@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Protocol
 
 import gtsam
@@ -39,6 +40,7 @@ STATES: dict[str, StateKind] = {
 KEYFRAME_LETTERS = tuple(kind.letter for kind in STATES.values() if kind.scope == "keyframe")
 
 
+@lru_cache(maxsize=1 << 18)
 def key(letter: str, index: int) -> int:
     """GTSAM key of a state."""
     return int(gtsam.symbol(letter, index))
@@ -126,6 +128,7 @@ class Step:
 
     predicted : state at t1 that the inertial data foretell; variance (3,) of its position m^2, where known
     foretell : (nav, bias) at t0 -> nav at t1, for states that have moved since
+    refresh : bias at t0 -> the inertial factor linearised there, None while the present one is good enough
     """
 
     index: int
@@ -135,6 +138,7 @@ class Step:
     bias: Any = None
     variance: Floats | None = None
     foretell: Callable[[Any, Any], Any] | None = None
+    refresh: Callable[[Any], Any] | None = None
     factors: list[tuple[Tag, Any]] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
     chain: dict[int, Floats] = field(default_factory=dict)
@@ -147,7 +151,15 @@ class Step:
         """Names of what touches this step."""
         return {tag.sensor for tag, _ in self.factors} | {block.sensor for block in self.blocks}
 
-    def keys(self) -> list[int]:
+    def refreshed(self, bias: Any) -> bool:
+        """Replace the inertial factor by one linearised at `bias`, the present estimate at t0, if that matters."""
+        factor = None if self.refresh is None else self.refresh(bias)
+        if factor is None:
+            return False
+        self.factors = [(tag, factor if tag.sensor == "imu" else old) for tag, old in self.factors]
+        return True
+
+    def names(self) -> list[int]:
         """Keys of the states this step introduces."""
         return [key(letter, self.index) for letter in KEYFRAME_LETTERS] + list(self.chain)
 

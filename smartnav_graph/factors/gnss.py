@@ -129,8 +129,8 @@ class PositionBuilder:
         if wanders:
             add_wander(step, window, previous, self.noise)
         rows = window.rows.get(self.name, ())
-        sigmas = self.scaled_sigma(memory)[rows] if len(rows) else ()
-        for row, sigma in zip(rows, sigmas, strict=True):
+        for row in rows:
+            sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
             if memory.is_rejected(self.name, int(row)):
                 continue
             loss = self._loss_of(int(row), sigma, step, memory)

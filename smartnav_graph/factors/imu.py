@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 # Bias steps, m/s^2 and rad/s, over which preintegration is repeated.
-STALE_BIAS = np.array([0.05] * 3 + [1e-3] * 3)
+STALE_BIAS = np.array([0.1] * 3 + [1e-3] * 3)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,6 @@ class ImuBuilder:
     bridges: dict[int, BridgeNoise] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
-    _linearised: dict[int, Floats] = field(default_factory=dict)
 
     def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -144,26 +143,26 @@ class ImuBuilder:
         tilt = (0.5 * self.gravity * length_s**2) ** 2 * before[:3].max()
         return np.asarray(before[3:6] + length_s**2 * before[6:9] + tilt + own)
 
-    def stale(self, bias: Floats) -> bool:
-        """Whether biases (n, 6) of the keyframes have left the points the windows were preintegrated at so far that the
-        first-order correction is no longer exact."""
-        used = np.array([self._linearised[i] for i in range(len(bias) - 1)]).reshape(-1, 6)
-        return bool((np.abs(bias[:-1] - used) > STALE_BIAS).any())
-
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
             return
         i, j = window.index - 1, window.index
         pim = self.preintegrate(window, previous.bias, memory)
-        self._linearised[i] = previous.bias.vector()
         step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias
         step.foretell = pim.predict
         if previous.covariance is not None:
             step.variance = self._variance(pim, window.length_s, previous, previous.covariance)
-        tag = Tag("imu", window.t1_ns)
-        step.add(tag, gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim))
+        used = previous.bias.vector()
+
+        def refresh(bias: Any) -> Any:
+            if (np.abs(bias.vector() - used) < STALE_BIAS).all():
+                return None
+            return _factor(i, j, self.preintegrate(window, bias, memory))
+
+        step.refresh = refresh
+        step.add(Tag("imu", window.t1_ns), _factor(i, j, pim))
         root = np.sqrt(window.length_s)
         walk = np.array(
             [self.noise.accel_bias_walk * memory.scale("accel_walk") * root] * 3
@@ -175,3 +174,7 @@ class ImuBuilder:
                 key("B", i), key("B", j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(walk)
             ),
         )
+
+
+def _factor(i: int, j: int, pim: Any) -> gtsam.ImuFactor:
+    return gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -14,8 +15,9 @@ from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
 from smartnav_graph.smoothers.estimate import (
     Estimate,
+    chronological_order,
     copy_state,
-    elimination_order,
+    dissection_order,
     indeterminate,
     nav_covariances,
     state_at,
@@ -111,7 +113,7 @@ class Batch:
             graph.native.push_back(self._anchor)
         elif since < HOLD_S:
             graph.native.push_back(_hold(self.steps[0]))
-        order = elimination_order(stretch)
+        order = chronological_order(stretch)
         try:
             solve = minimise(graph, self._recent, order, COARSE, lambda candidate: _shot(stretch, candidate))
             if self._stretch_s >= self.config.settle_s:
@@ -130,6 +132,11 @@ class Batch:
         else:
             self._stretch_s = self.config.settle_s
 
+    def _refresh(self, values: Any) -> bool:
+        """Preintegrate again where the bias has left its linearisation point; whether any window did."""
+        fresh = [step.refreshed(values.atConstantBias(key("B", before.index))) for before, step in pairwise(self.steps)]
+        return any(fresh)
+
     def _shoot(self, candidate: Any) -> Any:
         return _shot(self.steps, candidate)
 
@@ -141,13 +148,17 @@ class Batch:
         SolverError
             Not observable, not finite or not converged; names time, state and sensors.
         """
-        graph, indices = WholeGraph(self.steps), [step.index for step in self.steps]
-        order = elimination_order(self.steps)
+        indices, order = [step.index for step in self.steps], chronological_order(self.steps)
+        shoot = self._shoot if self.unsure else None
         begin = time.perf_counter()
         try:
-            solve = minimise(graph, self.values, order, self.solve, self._shoot if self.unsure else None)
+            graph = WholeGraph(self.steps)
+            solve = minimise(graph, self.values, order, self.solve, shoot)
+            if not self.unsure and self._refresh(solve.values):
+                graph = WholeGraph(self.steps)
+                solve = minimise(graph, solve.values, order, self.solve)
             solved = time.perf_counter()
-            tree = _eliminate(graph.linearize(solve.values), order)
+            tree = _eliminate(graph.linearize(solve.values), dissection_order(self.steps))
             covariance = nav_covariances(tree, solve.values, indices)
         except RuntimeError as error:
             raise self._explain(error) from error

@@ -84,11 +84,20 @@ def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
     return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
 
 
-def elimination_order(steps: Sequence[Step]) -> gtsam.Ordering:
-    """Keyframes by nested dissection of time, each with all the states of its step."""
+def chronological_order(steps: Sequence[Step]) -> gtsam.Ordering:
+    """Keyframes as they come: the cheapest solve of a chain."""
+    return _ordering(steps)
+
+
+def dissection_order(steps: Sequence[Step]) -> gtsam.Ordering:
+    """Keyframes by nested dissection of time: the cheapest marginals of a chain."""
+    return _ordering([steps[row] for row in nested_order(range(len(steps)))])
+
+
+def _ordering(steps: Sequence[Step]) -> gtsam.Ordering:
     order = gtsam.Ordering()
-    for row in nested_order(range(len(steps))):
-        for name in steps[row].keys():  # noqa: SIM118 (a method, not a dict)
+    for step in steps:
+        for name in step.names():
             order.push_back(name)
     return order
 

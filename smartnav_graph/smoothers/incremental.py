@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.graph import State, Step, key
-from smartnav_graph.smoothers.estimate import Estimate, elimination_order, indeterminate, nav_covariances, to_nav_axes
+from smartnav_graph.smoothers.estimate import Estimate, dissection_order, indeterminate, nav_covariances, to_nav_axes
 from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
 
 Floats = NDArray[np.float64]
@@ -102,7 +102,7 @@ class Incremental:
         self._make_room(step)
         try:
             if self._fixed_lag:
-                stamps = dict.fromkeys(step.keys(), step.t_s)
+                stamps = dict.fromkeys(step.names(), step.t_s)
                 self._engine.update(graph, step.values(), stamps)
             else:
                 self._engine.update(graph, step.values())
@@ -158,7 +158,7 @@ class Incremental:
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
         graph, values, indices = WholeGraph(steps), self.values(), [step.index for step in steps]
-        tree = graph.linearize(values).eliminateMultifrontal(elimination_order(steps), gtsam.EliminateQR)
+        tree = graph.linearize(values).eliminateMultifrontal(dissection_order(steps), gtsam.EliminateQR)
         return Estimate(
             values=values,
             indices=indices,
