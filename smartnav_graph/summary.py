@@ -22,6 +22,8 @@ from smartnav_graph.solution import POS, Solution
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
 STATE_DIM = 15
+# Chi-square per degree of freedom that no tolerable noise model explains: residuals twice their sigma.
+MISFIT = 4.0
 
 
 def versions() -> dict[str, str]:
@@ -74,6 +76,23 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
     return {name: round(value, 5) for name, value in result.items()}
 
 
+def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
+    """What speaks against the solution."""
+    doubts = []
+    if not absolute:
+        doubts.append(
+            "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
+        )
+    if not estimate.converged:
+        doubts.append("solve: the iteration limit was reached before the cost settled; raise solve.max_iterations")
+    if chi2 > MISFIT:
+        doubts.append(
+            f"solve: chi-square per degree of freedom is {chi2:.1f}, about 1 is expected: the measurements contradict "
+            "each other or their sigmas are too small; check units, axes and clocks with `smartnav info`"
+        )
+    return doubts
+
+
 def summarise(
     problem: Problem,
     initial: Initial,
@@ -93,13 +112,8 @@ def summarise(
     for block in estimate.blocks:
         factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, memory))
-    warnings = list(problem.warnings)
-    if not absolute:
-        warnings.append(
-            "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
-        )
-    if not estimate.converged:
-        warnings.append("solve: the iteration limit was reached before the cost settled; raise solve.max_iterations")
+    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes)
+    warnings = [*problem.warnings, *_doubts(estimate, absolute, chi2["overall"])]
     summary: dict[str, Any] = {
         "mode": "batch" if absolute else "dead-reckoning",
         "vehicle": problem.vehicle,
@@ -115,7 +129,7 @@ def summarise(
         "path_m": keyframes.path_length(),
         "keyframes": len(keyframes),
         "factors": factors,
-        "chi2_per_dof": _chi2_per_dof(problem, estimate, memory, keyframes),
+        "chi2_per_dof": chi2,
         "iterations": estimate.iterations,
         "converged": estimate.converged,
         "cost": estimate.cost,
