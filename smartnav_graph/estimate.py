@@ -223,7 +223,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     clock.lap("initialise")
     options = problem.config.replay
     smoother = Incremental(options, problem.session.t0_ns)
-    builders = [initial.prior, *problem.builders]
+    builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
     memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering)
     latency: list[float] = []

@@ -6,7 +6,7 @@ position has no prior unless one was given; biases have the turn-on spread of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -17,6 +17,7 @@ from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
 Floats = NDArray[np.float64]
 
 UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
+UNKNOWN_PLACE = 1e5  # m
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,11 @@ class PriorBuilder:
     velocity_mean: Floats
     bias_mean: gtsam.imuBias.ConstantBias
     name: str = "prior"
+
+    def placed(self) -> PriorBuilder:
+        """The same with a position sigma of 100 km where there is none, for a smoother that solves at the first
+        keyframe and cannot wait for the first fix."""
+        return self if self.sigma_pos is not None else replace(self, sigma_pos=np.full(3, UNKNOWN_PLACE))
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Prior factors and initial values of the first keyframe; nothing later."""
