@@ -18,7 +18,7 @@ from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
 from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.imu import ImuConfig
-from smartnav_graph.graph import Memory, State, Tag, Window, build_step, key
+from smartnav_graph.graph import STATES, Memory, State, Tag, Window, build_step, key
 from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
 from smartnav_graph.prediction import Kinematics
 from smartnav_graph.session import Device, Mount, Session
@@ -69,14 +69,14 @@ def record(
 ) -> Recording:
     """A session of `trajectory`; `noise` (ImuNoise) and a `seed` make it noisy."""
     trajectory = trajectory or eight()
-    t = np.arange(round(trajectory.duration * hertz) + 1) / hertz
+    t = np.arange(int(trajectory.duration * hertz + 1e-6) + 1) / hertz
     t_ns = START_NS + ns_from_seconds(t)
     rng = np.random.default_rng(seed)
     imu, biases = sensors.imu(trajectory.sample(t), t_ns, noise, GRAVITY, rng)
-    at = np.arange(0.5037, trajectory.duration, every_s)
+    at = np.arange(0.5037, t[-1], every_s)
     streams = {}
     for name, times in (("gnss", at), ("control", at[2::5] + 0.25)):
-        times = times[times < trajectory.duration]
+        times = times[times < t[-1]]
         there = trajectory.sample(times)
         enu = there.nav_t_body + there.nav_R_body @ np.array(LEVER)
         if seed is not None:
@@ -181,3 +181,24 @@ def angle_deg(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Rotation angle (n,) between attitudes (n, 3, 3), degrees; exact near zero."""
     sine = np.linalg.norm(one - other, axis=(-2, -1)) / np.sqrt(8.0)
     return np.degrees(2.0 * np.arcsin(np.clip(sine, 0.0, 1.0)))
+
+
+def numerical_jacobian(factor, values, name: int, size: int, step: float = 1e-5) -> np.ndarray:
+    """Central differences of the whitened residual on the tangent of one state."""
+    columns = []
+    for i in range(size):
+        moved = []
+        for sign in (1.0, -1.0):
+            delta = gtsam.VectorValues()
+            delta.insert(name, sign * step * np.eye(size)[i])
+            moved.append(factor.whitenedError(values.retract(delta)))
+        columns.append((moved[0] - moved[1]) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def assert_derivative(factor, values) -> None:
+    """The factor's own derivative is the numerical one, to a fifty-thousandth of its largest element."""
+    analytic, _ = factor.linearize(values).jacobian()
+    blocks = [(name, STATES[chr(gtsam.symbolChr(name))].dim) for name in list(factor.keys())]
+    numeric = np.hstack([numerical_jacobian(factor, values, name, n) for name, n in blocks])
+    np.testing.assert_allclose(analytic, numeric, atol=2e-5 * np.abs(numeric).max())

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
-from exact import GRAVITY, LEVER, Graph, Recording, assemble, record
+from exact import GRAVITY, LEVER, Graph, Recording, assemble, assert_derivative, record
 from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES
@@ -181,27 +181,6 @@ def test_a_mistake_shows_in_the_residual(mutation, recording, graph):
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
-
-
-def numerical_jacobian(factor, values, name: int, size: int, step: float = 1e-5) -> np.ndarray:
-    """Central differences of the whitened residual on the tangent of one state."""
-    columns = []
-    for i in range(size):
-        moved = []
-        for sign in (1.0, -1.0):
-            delta = gtsam.VectorValues()
-            delta.insert(name, sign * step * np.eye(size)[i])
-            moved.append(factor.whitenedError(values.retract(delta)))
-        columns.append((moved[0] - moved[1]) / (2 * step))
-    return np.stack(columns, axis=-1)
-
-
-def assert_derivative(factor, values) -> None:
-    analytic, _ = factor.linearize(values).jacobian()
-    sizes = {"X": 6, "V": 3, "B": 6}
-    blocks = [(name, sizes[chr(gtsam.symbolChr(name))]) for name in list(factor.keys())]
-    numeric = np.hstack([numerical_jacobian(factor, values, name, n) for name, n in blocks])
-    np.testing.assert_allclose(analytic, numeric, atol=2e-5 * np.abs(numeric).max())
 
 
 def disturbed(graph: Graph, index: int) -> gtsam.Values:

@@ -1,0 +1,106 @@
+"""Keys, steps, memory and the elimination order."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from smartnav_graph.graph import (
+    KEYFRAME_LETTERS,
+    STATES,
+    Memory,
+    State,
+    Step,
+    Tag,
+    Window,
+    build_step,
+    key,
+    nested_order,
+)
+from smartnav_graph.timebase import NS
+
+
+def window(index: int = 3, t_s: float = 7.5) -> Window:
+    return Window(index, round((t_s - 1) * NS), round(t_s * NS), "normal", *np.zeros((1, 1)), *np.zeros((2, 1, 3)))
+
+
+def test_every_state_has_its_own_letter_and_the_keyframe_has_three():
+    assert KEYFRAME_LETTERS == ("X", "V", "B")
+    assert {STATES[letter].dim for letter in "XB"} == {6} and STATES["V"].dim == 3
+    assert {kind.scope for kind in STATES.values()} <= {"keyframe", "chain", "session"}
+    keys = {key(letter, index) for letter in STATES for index in (0, 1, 10_000)}
+    assert len(keys) == 3 * len(STATES)
+    assert chr(gtsam.symbolChr(key("V", 12))) == "V" and gtsam.symbolIndex(key("V", 12)) == 12
+
+
+def test_a_step_asks_every_builder_in_turn():
+    seen = []
+
+    class Spy:
+        def __init__(self, name):
+            self.name = name
+
+        def add(self, step, window, previous, memory):
+            seen.append((self.name, window.index, previous, memory))
+            step.add(Tag(self.name, window.t1_ns), None)
+
+    memory, previous = Memory(), State(2, 0, None, None)
+    step = build_step(window(), previous, [Spy("imu"), Spy("gnss")], memory, 5 * NS)
+    assert seen == [("imu", 3, previous, memory), ("gnss", 3, previous, memory)]
+    assert [tag.sensor for tag, _ in step.factors] == ["imu", "gnss"]
+    assert (step.index, step.t_ns, step.t_s) == (3, 7_500_000_000, 2.5)
+
+
+def test_the_values_of_a_step_are_its_own_states():
+    step = Step(4, NS, 1.0, predicted=gtsam.NavState(gtsam.Rot3.Rz(0.3), np.ones(3), 2 * np.ones(3)))
+    step.bias = gtsam.imuBias.ConstantBias(np.full(3, 0.1), np.full(3, 0.2))
+    step.chain[key("C", 4)] = np.full(3, 5.0)
+    values = step.values()
+    assert set(values.keys()) == {key(letter, 4) for letter in "XVBC"}
+    np.testing.assert_array_equal(values.atVector(key("V", 4)), 2.0)
+    np.testing.assert_array_equal(values.atVector(key("C", 4)), 5.0)
+    np.testing.assert_array_equal(values.atConstantBias(key("B", 4)).vector(), [0.1] * 3 + [0.2] * 3)
+
+
+def test_length_of_a_window():
+    assert window().length_s == pytest.approx(1.0)
+
+
+def test_memory_knows_nothing_at_first_and_cannot_be_written():
+    memory = Memory(noise_scales={"gyro": 2.0}, rejected={"gnss": frozenset({3})})
+    assert (memory.scale("gyro"), memory.scale("accel")) == (2.0, 1.0)
+    assert memory.is_rejected("gnss", 3) and not memory.is_rejected("gnss", 4) and not memory.is_rejected("control", 3)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        memory.phase = "robust"
+
+
+@given(st.integers(0, 300))
+def test_the_elimination_order_holds_every_keyframe_once(n):
+    assert sorted(nested_order(range(10, 10 + n))) == list(range(10, 10 + n))
+
+
+def depth_of(order: list[int]) -> int:
+    """Height of the elimination tree of a chain eliminated in this order."""
+    place = {node: i for i, node in enumerate(order)}
+    neighbours = {node: {m for m in (node - 1, node + 1) if m in place} for node in order}
+    parent: dict[int, int] = {}
+    for node in order:
+        later = {m for m in neighbours[node] if place[m] > place[node]}
+        if later:
+            parent[node] = min(later, key=place.__getitem__)
+            neighbours[parent[node]] |= later - {parent[node]}
+    heights = dict.fromkeys(order, 1)
+    for node in order:
+        if node in parent:
+            heights[parent[node]] = max(heights[parent[node]], heights[node] + 1)
+    return max(heights.values())
+
+
+def test_the_tree_of_a_chain_has_logarithmic_depth():
+    assert depth_of(list(range(1023))) == 1023  # in order of time
+    assert depth_of(nested_order(range(1023))) == 10

@@ -1,0 +1,206 @@
+"""What a pass learns: the sigma of fixes that carry none, and which fixes are outliers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact import assemble, estimate_of, record, state
+
+from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
+from smartnav_graph.config import Config, RunConfig
+from smartnav_graph.estimate import initialise, solve_passes
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.graph import Memory
+from smartnav_graph.problem import prepare
+from smartnav_graph.revise import LEAST_SIGMA, fix_residuals, revise
+from smartnav_graph.simulation import motions
+from smartnav_graph.streams import GnssFix
+
+GOOD_SEED = 1  # of 174 good fixes none lies outside the gate by itself
+WHITE = GnssNoise(correlated_horizontal_sigma=0.0, correlated_vertical_sigma=0.0)  # 3 m and 5 m, no wander
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A minute of a car with exact fixes, half a second apart."""
+    noise = DEVICE_CLASSES["mems"]
+    made = record(
+        motions.car(60.0, np.random.default_rng(5), start_speed=12.0), every_s=0.5, noise=noise, fix_sigma=1e-9, seed=1
+    )
+    calibration = Calibration(imu_noise=noise, gnss_noise=WHITE)
+    return replace(made, session=made.session.replace(control=None, calibration=calibration))
+
+
+def with_fixes(drive, sigma, told=None, seed: int = 0, off=()):
+    """The drive with noisy fixes; `told` their sigma columns; `off` rows moved 30 to 120 m away."""
+    rng = np.random.default_rng(seed)
+    fix = drive.session.gnss
+    enu = fix.enu + np.array(sigma) * rng.standard_normal(fix.enu.shape)
+    for row in off:
+        angle = rng.uniform(0, 2 * np.pi)
+        enu[row] += rng.uniform(30, 120) * np.array([np.cos(angle), np.sin(angle), 0.0])
+    told = None if told is None else np.tile(told, (len(fix), 1))
+    return drive.session.replace(gnss=GnssFix(t_ns=fix.t_ns, enu=enu, sigma=told))
+
+
+def learn(drive, session) -> tuple[Memory, int]:
+    """What all passes have learnt, started at the truth, and their number."""
+    problem = prepare(session, Config(run=RunConfig(passes=10)))
+    t_ns = problem.windows[0].t1_ns
+    start = state(drive.truth([t_ns]), 0, t_ns, np.zeros(6))
+    prior = PriorBuilder(
+        start,
+        np.full(3, 0.1),
+        None,
+        np.full(3, 1.0),
+        np.array([0.3] * 3 + [0.05] * 3),
+        start.nav.velocity(),
+        start.bias,
+    )
+    _, memory, passes = solve_passes(problem, problem.windows, prior, Memory())
+    return memory, passes
+
+
+# --- sigma ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("planted", [0.3, 1.2, 4.0])
+def test_the_sigma_of_fixes_is_found_within_fifteen_per_cent(drive, planted):
+    # about 300 residuals: 1 / sqrt(600) = 4 %
+    memory, passes = learn(drive, with_fixes(drive, [planted, planted, planted * 5 / 3]))
+    assert 3.0 * memory.scale("gnss") == pytest.approx(planted, rel=0.15)
+    assert memory.rejected.get("gnss", frozenset()) == frozenset() and passes < 10
+
+
+def test_a_sigma_that_came_with_the_data_is_left_alone(drive):
+    memory, _ = learn(drive, with_fixes(drive, [1.0, 1.0, 1.0], told=[3.0, 3.0, 3.0]))
+    assert memory.scale("gnss") == 1.0
+
+
+def test_exact_fixes_are_believed_no_better_than_three_centimetres(drive):
+    memory, _ = learn(drive, with_fixes(drive, [1e-6, 1e-6, 1e-6]))
+    assert 3.0 * memory.scale("gnss") >= LEAST_SIGMA - 1e-12
+
+
+def test_outliers_do_not_swell_the_sigma(drive):
+    off = frozenset({7, 30, 31, 32, 70, 95})
+    memory, _ = learn(drive, with_fixes(drive, [1.2, 1.2, 2.0], off=off))
+    assert 3.0 * memory.scale("gnss") == pytest.approx(1.2, rel=0.2)
+    assert memory.rejected["gnss"] == off
+
+
+# --- outliers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "off",
+    [{100}, {70, 90, 91, 92, 120, 150, 171}, set(range(100, 112)), {60, 172}],
+    ids=["one", "several", "a burst of six seconds", "near the end"],
+)
+def test_planted_outliers_are_found_exactly(drive, off):
+    memory, _ = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED))
+    assert memory.rejected["gnss"] == frozenset(off)
+    assert memory.phase == "gated"
+
+
+@pytest.mark.parametrize("off", [{40}, {1, 110}], ids=["one", "near the start"])
+def test_outliers_among_the_first_fixes_do_not_mislead_the_start(drive, off):
+    problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), Config())
+    initial = initialise(problem)
+    _, memory, _ = solve_passes(problem, problem.windows, initial.prior, initial.memory)
+    assert memory.rejected["gnss"] == frozenset(off)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_good_fixes_are_all_kept_without_a_robust_pass(drive, seed):
+    memory, passes = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, seed=seed))
+    assert not memory.rejected.get("gnss") and memory.phase == "plain" and passes <= 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sigmas_too_small_by_three_reject_nothing_wholesale(drive, seed):
+    memory, _ = learn(drive, with_fixes(drive, [3.0] * 3, told=[1.0] * 3, seed=seed))
+    assert len(memory.rejected.get("gnss", ())) <= 2  # of 130
+
+
+def test_a_loss_that_is_no_gate_rejects_nothing(drive):
+    session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
+    for loss in ("huber", "none"):
+        problem = prepare(session, Config(gnss=GnssConfig(loss=loss)))
+        graph = assemble(session, drive.truth)
+        learnt, done = revise(problem.builders, graph.windows, estimate_of(graph), Memory())
+        assert done and learnt.phase == "plain" and not learnt.rejected
+
+
+# --- one step at a time, at the true states ---------------------------------------------------------------------------
+
+
+def at_truth(drive, session, **config):
+    graph = assemble(session, drive.truth)
+    builder = graph.builders["gnss"]
+    builder.config = GnssConfig(**config)
+    n = len(graph.windows)
+    return [builder], graph.windows, estimate_of(graph, np.tile(1e-4 * np.eye(15), (n, 1, 1)))
+
+
+def test_residuals_are_those_of_the_antenna(drive):
+    session = with_fixes(drive, [0.0] * 3)
+    shifted = session.replace(gnss=replace(session.gnss, enu=session.gnss.enu - [1.0, 2.0, 3.0]))
+    (builder,), windows, estimate = at_truth(drive, shifted)
+    found = fix_residuals(builder, windows, estimate, Memory(noise_scales={"gnss": 2.0}))
+    np.testing.assert_allclose(found.residual, np.tile([1.0, 2.0, 3.0], (len(session.gnss), 1)), atol=1e-6)
+    np.testing.assert_allclose(found.sigma, np.tile([6.0, 6.0, 10.0], (len(session.gnss), 1)))
+    np.testing.assert_allclose(found.square, 1 / 36 + 4 / 36 + 9 / 100)
+    np.testing.assert_allclose(found.posterior, 1e-4)
+    assert found.rows.tolist() == list(range(len(session.gnss)))
+
+
+def test_the_variance_component_uses_the_redundancy(drive):
+    # residual variance 1 m^2 where the posterior takes half of a variance of 2 m^2: the noise is 2 m^2
+    session = with_fixes(drive, [0.6, 0.6, 1.0])
+    builders, windows, estimate = at_truth(drive, session)
+    half = np.zeros((len(windows), 15, 15))
+    half[:, range(3, 6), range(3, 6)] = np.array([9.0, 9.0, 25.0]) / 2  # half of the default's variance
+    plain, _ = revise(builders, windows, estimate, Memory())
+    learnt, _ = revise(builders, windows, replace(estimate, covariance=half), Memory())
+    assert plain.scale("gnss") == pytest.approx(0.2, rel=0.1)
+    assert learnt.scale("gnss") == pytest.approx(plain.scale("gnss") * np.sqrt(2), rel=0.01)
+
+
+def test_a_step_of_the_scale_is_bounded(drive):
+    builders, windows, estimate = at_truth(drive, with_fixes(drive, [300.0, 300.0, 500.0]))
+    learnt, done = revise(builders, windows, estimate, Memory())
+    assert learnt.scale("gnss") == pytest.approx(5.0) and not done
+
+
+def test_too_few_fixes_teach_no_sigma(drive):
+    session = with_fixes(drive, [30.0] * 3)
+    session = session.replace(gnss=session.gnss.take(slice(0, 3)))
+    builders, windows, estimate = at_truth(drive, session, loss="none")
+    assert revise(builders, windows, estimate, Memory()) == (Memory(), True)
+
+
+def test_phases_follow_each_other(drive):
+    session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
+    builders, windows, estimate = at_truth(drive, session)
+    one, done = revise(builders, windows, estimate, Memory())
+    assert (one.phase, done, dict(one.rejected)) == ("robust", False, {})
+    two, done = revise(builders, windows, estimate, one)
+    assert (two.phase, done, dict(two.rejected)) == ("gated", False, {"gnss": frozenset({40})})
+    three, done = revise(builders, windows, estimate, two)
+    assert (three, done) == (two, True)
+
+
+def test_a_row_inside_the_gate_is_let_in_again(drive):
+    builders, windows, estimate = at_truth(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3))
+    rejected = Memory(phase="gated", rejected={"gnss": frozenset({5, 6})})
+    learnt, done = revise(builders, windows, estimate, rejected)
+    assert learnt.rejected["gnss"] == frozenset() and not done
+
+
+def test_without_positions_there_is_nothing_to_learn(drive):
+    graph = assemble(drive.session, drive.truth)
+    assert revise([graph.builders["imu"]], graph.windows, estimate_of(graph), Memory()) == (Memory(), True)
