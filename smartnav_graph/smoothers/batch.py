@@ -22,14 +22,14 @@ from smartnav_graph.smoothers.estimate import (
     nav_covariances,
     state_at,
 )
-from smartnav_graph.smoothers.minimise import COARSE, SolveConfig, minimise
+from smartnav_graph.smoothers.minimise import COARSE, Solve, SolveConfig, minimise
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 
 @dataclass(frozen=True)
 class BatchConfig:
     """settle_s : stretch after which the latest steps are solved by themselves, so that later windows start from an
-    anchored state; it doubles up to longest_settle_s while that is easy."""
+    anchored state; as the gyro bias becomes known it grows to longest_settle_s."""
 
     settle_s: float = 30.0
     longest_settle_s: float = 240.0
@@ -45,10 +45,13 @@ class BatchConfig:
 
 # Growing stretches shorter than this hold the first attitude.
 HOLD_S = 10.0
-# A settled stretch that took no more iterations than this may be longer next time.
-EASY = 6
+# A stretch that costs more than this a keyframe fits badly, and is solved again in parts that double from so many.
+BAD_COST = 2.5
+GROW_FROM = 4
+# Turn (rad) that the gyro bias may add to a dead-reckoned guess.
+LARGEST_TURN = 0.1
 # Factor on the covariance that a settled stretch hands to the next: a linearised covariance is optimistic.
-ANCHOR_SLACK = 9.0
+ANCHOR_SLACK = 1.5
 
 
 @dataclass
@@ -107,30 +110,62 @@ class Batch:
         dead-reckoned guess away before there are enough fixes to stop it.
         """
         stretch = self.steps[self._settled :]
-        first = self._settled == 0
-        graph = WholeGraph(stretch if first else stretch[1:])
-        if not first:
-            graph.native.push_back(self._anchor)
-        elif since < HOLD_S:
-            graph.native.push_back(_hold(self.steps[0]))
-        order = chronological_order(stretch)
+        growing = self.unsure and self._settled == 0 and self._stretch_s < self.config.settle_s
         try:
-            solve = minimise(graph, self._recent, order, COARSE, lambda candidate: _shot(stretch, candidate))
-            if self._stretch_s >= self.config.settle_s:
-                tree = _eliminate(graph.linearize(solve.values), order)
+            solve = self._solve_stretch(stretch, self._recent, since)
+            if solve.cost > BAD_COST * len(stretch) and len(stretch) > GROW_FROM:
+                solve = min(solve, self._grown(stretch, since), key=lambda s: s.cost)
+            if not growing:
+                graph = self._stretch_graph(stretch, since)
+                tree = _eliminate(graph.linearize(solve.values), chronological_order(stretch))
                 self._anchor = _anchor(tree, solve.values, stretch[-1])
                 self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
             return  # not observable yet: a longer stretch is tried at the next step
         self.values.update(solve.values)
         self._recent = solve.values
-        if self._settled == len(self.steps) - 1:
+        if growing:
+            self._stretch_s = min(2.0 * self._stretch_s, self.config.settle_s)
+        else:
             self._recent = gtsam.Values()
             copy_state(self.steps[-1], self.values, self._recent)
-        if self._stretch_s < self.config.settle_s or solve.iterations <= EASY:
-            self._stretch_s = min(2.0 * self._stretch_s, self.config.longest_settle_s)
-        else:
-            self._stretch_s = self.config.settle_s
+            self._stretch_s = self._next_stretch(tree)
+
+    def _next_stretch(self, tree: Any) -> float:
+        """As long as the gyro bias is unlikely to turn the guess by more than `LARGEST_TURN`."""
+        bias = np.diag(tree.marginalCovariance(key("B", self.steps[-1].index)))[3:]
+        return float(
+            np.clip(LARGEST_TURN / np.sqrt(bias.max()), 0.3 * self.config.settle_s, self.config.longest_settle_s)
+        )
+
+    def _stretch_graph(self, stretch: Sequence[Step], since: float) -> WholeGraph:
+        """Factors of a stretch, held at its beginning."""
+        first = stretch[0] is self.steps[0]
+        graph = WholeGraph(stretch if first else stretch[1:])
+        if not first:
+            graph.native.push_back(self._anchor)
+        elif since < HOLD_S:
+            graph.native.push_back(_hold(self.steps[0]))
+        return graph
+
+    def _solve_stretch(self, stretch: Sequence[Step], values: Any, since: float) -> Solve:
+        graph, order = self._stretch_graph(stretch, since), chronological_order(stretch)
+        return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate))
+
+    def _grown(self, stretch: Sequence[Step], since: float) -> Solve:
+        """Solve a stretch from its beginning in doubling parts, each foretold from the part before."""
+        values, size, solve = gtsam.Values(), GROW_FROM, None
+        copy_state(stretch[0], self._recent, values)
+        while solve is None or size < len(stretch):
+            size = min(2 * size, len(stretch))
+            part = stretch[:size]
+            for step in part:
+                if not values.exists(key("X", step.index)):
+                    copy_state(step, self._recent, values)
+            known = 0 if solve is None else size // 2 - 1
+            solve = self._solve_stretch(part, _shot(part[known:], values), since)
+            values = solve.values
+        return solve
 
     def _refresh(self, values: Any) -> bool:
         """Preintegrate again where the bias has left its linearisation point; whether any window did."""
