@@ -20,6 +20,7 @@ from smartnav_graph.assemble import Withheld, causal_solution, densify, score, t
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
+from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph import Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
@@ -61,7 +62,7 @@ class Clock:
     """Wall seconds by stage."""
 
     def __init__(self) -> None:
-        self.stages: dict[str, float] = {}
+        self.stages: dict[str, float] = dict.fromkeys(("prepare", "initialise", "preintegrate", "build"), 0.0)
         self._start = self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
@@ -69,6 +70,11 @@ class Clock:
         now = time.perf_counter()
         self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
         self._last = now
+
+    def spend(self, stage: str, seconds: float) -> None:
+        """Add `seconds` to `stage` and take them from whatever the next lap is called."""
+        self.stages[stage] = self.stages.get(stage, 0.0) + seconds
+        self._last += seconds
 
     def to_dict(self) -> dict[str, float]:
         """Seconds by stage and in all."""
@@ -93,6 +99,7 @@ def solve_passes(
     unsure: bool = False,
     first_s: float = 0.0,
     progress: Progress = _silent,
+    clock: Clock | None = None,
 ) -> tuple[Estimate, Memory, int]:
     """Batch passes until there is nothing more to learn.
 
@@ -111,11 +118,30 @@ def solve_passes(
         smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
         one_pass(smoother, windows, builders, memory, problem)
         estimate = smoother.estimate()
+        if clock is not None:
+            _account(clock, estimate, problem.builders)
         learnt, done = revise(problem.builders, windows, estimate, memory)
         if done or count == most or (unsure and learnt.correlated):
             return estimate, memory, count
         memory, warm = learnt, estimate.values
     raise AssertionError("unreachable")
+
+
+def _forget(builders: Sequence[Builder]) -> None:
+    """Start the builders' own clocks anew."""
+    for builder in builders:
+        if isinstance(builder, ImuBuilder):
+            builder.spent()
+
+
+def _account(clock: Clock, estimate: Estimate, builders: Sequence[Builder]) -> None:
+    """Time of one pass by stage: what is neither preintegration nor algebra is building."""
+    for stage, seconds in estimate.seconds.items():
+        clock.spend(stage, seconds)
+    for builder in builders:
+        if isinstance(builder, ImuBuilder):
+            clock.spend("preintegrate", builder.spent())
+    clock.lap("build")
 
 
 def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
@@ -168,11 +194,18 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     problem = prepare(session, config or Config())
     clock.lap("prepare")
     initial = initialise(problem)
+    _forget(problem.builders)
     clock.lap("initialise")
     estimate, memory, passes = solve_passes(
-        problem, problem.windows, initial.prior, initial.memory, first_s=initial.stretch_s, progress=progress
+        problem,
+        problem.windows,
+        initial.prior,
+        initial.memory,
+        first_s=initial.stretch_s,
+        progress=progress,
+        clock=clock,
     )
-    clock.lap("solve")
+    clock.lap("build")
     _refuse_empty(problem, memory)
     return _finish(problem, initial, estimate, memory, clock, {"passes": passes})
 

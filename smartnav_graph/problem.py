@@ -61,15 +61,16 @@ def prepare(session: Session, config: Config) -> Problem:
         bridged_rows=g.bridged_rows,
         straightness=g.straightness,
     )
+    asked = _span(session, config)
+    gaps = [gap for gap in gaps if gap.end_ns > asked[0] and gap.start_ns < asked[1]]
     checked = health.inspect(session, gaps)
     checked.raise_errors()
     warnings = checked.warnings()
     session = _choose_sensors(session, config.run.sensors)
     session, withheld = split(session, config.run.withhold)
-    span = _span(session, config)
-    session, dropped = _inside_span(session, span)
+    session, dropped = _inside_span(session, asked)
     aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
-    span, told = _trimmed(span, aiding, config.keyframes.lead_s, session.t0_ns)
+    span, told = _trimmed(asked, aiding, config.keyframes.lead_s, session.t0_ns)
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     times = keyframe_times(span, list(aiding.values()), gaps, config.keyframes)
     windows = make_windows(imu, times, gaps, aiding, config.keyframes)

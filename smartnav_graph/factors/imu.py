@@ -9,6 +9,7 @@ Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegratio
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -95,6 +96,7 @@ class ImuBuilder:
     bridges: dict[int, BridgeNoise] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
+    _spent_s: float = 0.0
 
     def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -119,11 +121,18 @@ class ImuBuilder:
 
     def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
         """GTSAM preintegrated measurements of one window, linearised at `bias`."""
+        begin = time.perf_counter()
         pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, memory), bias)
         integrate = pim.integrateMeasurement
         for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
             integrate(accel, gyro, dt)
+        self._spent_s += time.perf_counter() - begin
         return pim
+
+    def spent(self) -> float:
+        """Wall seconds of preintegration since the last call."""
+        seconds, self._spent_s = self._spent_s, 0.0
+        return seconds
 
     def _params_of(self, window: Window, memory: Memory) -> gtsam.PreintegrationParams:
         bridge = self._bridge(window)

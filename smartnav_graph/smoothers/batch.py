@@ -212,7 +212,6 @@ class Batch:
             seconds={
                 "solve": self._settle_s + solved - begin,
                 "covariance": time.perf_counter() - solved,
-                "settle": self._settle_s,
             },
         )
 
