@@ -67,6 +67,14 @@ def test_streams_of_several_rows_an_epoch_keep_them():
     assert rows["image_id"].tolist() == [2, 0, 1]
 
 
+def test_rows_of_one_epoch_keep_their_order():
+    t = np.repeat(np.arange(200)[::-1], 5)
+    table = {"t_ns": t, "image_id": np.arange(1000), "track_id": np.arange(1000)}
+    table |= {"x_n": np.zeros(1000), "y_n": np.zeros(1000)}
+    rows, _ = repair(Tracks, table, ["order"])
+    assert (np.diff(rows["image_id"].reshape(200, 5), axis=1) == 1).all()
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_rows_with_a_broken_required_value_are_dropped(bad):
     table = imu_table(50)
