@@ -148,8 +148,8 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
     """First state of a problem; `longest_s` bounds the stretch it may look at."""
     session, config = problem.session, problem.config.initialise
     if longest_s is not None:
-        config = replace(config, max_stretch_s=min(config.max_stretch_s, longest_s))
-        config = replace(config, stretch_s=min(config.stretch_s, config.max_stretch_s))
+        most = min(config.max_stretch_s, longest_s)
+        config = replace(config, max_stretch_s=most, stretch_s=min(config.stretch_s, most))
 
     def solve(prior: PriorBuilder, count: int) -> tuple[Estimate, Memory]:
         estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, Memory(), unsure=True)
