@@ -123,7 +123,10 @@ def solve_passes(
         learnt, done = revise(problem.builders, windows, estimate, memory)
         if done or count == most or (unsure and learnt.correlated):
             return estimate, memory, count
-        memory, warm = learnt, estimate.values
+        # Least squares bent by outliers is no start for a redescending loss: settled stretch by stretch it stays near
+        # the truth, and a burst stands out against what is foretold.
+        warm = None if learnt.phase == "robust" and not unsure else estimate.values
+        memory = learnt
     raise AssertionError("unreachable")
 
 
