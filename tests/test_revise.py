@@ -97,8 +97,9 @@ def test_outliers_do_not_swell_the_sigma(drive):
 
 @pytest.mark.parametrize(
     "off",
-    [{100}, {70, 90, 91, 92, 120, 150, 171}, set(range(100, 112)), {60, 172}],
-    ids=["one", "several", "a burst of six seconds", "near the end"],
+    # the early burst and the early outlier bend the least squares solution so far that a loss started there fails
+    [{100}, {70, 90, 91, 92, 120, 150, 171}, set(range(100, 112)), {60, 172}, set(range(50, 62)), {1, 110}],
+    ids=["one", "several", "a burst of six seconds", "near the end", "an early burst", "near the start"],
 )
 def test_planted_outliers_are_found_exactly(drive, off):
     memory, _ = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED))
