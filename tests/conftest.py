@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+import smartnav_graph as sn
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -19,3 +21,9 @@ def dataset():
         return path
 
     return folder
+
+
+@pytest.fixture(scope="session")
+def kitti():
+    """The KITTI drive that comes with gtsam; sessions are frozen, so one copy serves all."""
+    return sn.load("gtsam-kitti")

@@ -1,0 +1,136 @@
+"""States, covariances and their axes; what GTSAM's complaint becomes."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from exact import record
+
+from smartnav_graph import estimate as loop
+from smartnav_graph.config import Config
+from smartnav_graph.graph import KEYFRAME_LETTERS, Memory, State, Step, key
+from smartnav_graph.problem import prepare
+from smartnav_graph.smoothers import estimate as room
+
+
+@pytest.fixture(scope="module")
+def solved():
+    problem = prepare(record(seed=0, fix_sigma=0.1).session, Config())
+    initial = loop.initialise(problem)
+    return loop.solve_passes(problem, problem.windows, initial.prior, Memory())[0]
+
+
+def test_a_state_goes_into_values_and_comes_back():
+    nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([1.0, 2.0, 3.0])), np.array([4.0, 5.0, 6.0]))
+    bias = gtsam.imuBias.ConstantBias(np.full(3, 0.1), np.full(3, 0.01))
+    values = gtsam.Values()
+    for letter, value in (("X", nav.pose()), ("V", nav.velocity()), ("B", bias)):
+        values.insert(key(letter, 7), value)
+    state = room.state_at(values, 7, 123)
+    assert isinstance(state, State) and (state.index, state.t_ns) == (7, 123)
+    assert state.nav.equals(nav, 0.0) and state.bias.equals(bias, 0.0)
+    R, p, v, b = room.states_of(values, [7])
+    assert (R.shape, p.shape, v.shape, b.shape) == ((1, 3, 3), (1, 3), (1, 3), (1, 6))
+    assert np.array_equal(b[0], [0.1] * 3 + [0.01] * 3)
+
+
+def test_body_covariance_in_nav_axes():
+    """Heading north seen from a body turned by 90 deg: variances 9 along body x are 9 along nav y."""
+    joint = np.diag([9.0, 1.0, 1.0, 16.0, 1.0, 1.0] + [2.0, 3.0, 4.0] + [5.0] * 6)[None]
+    turned = room.to_nav_axes(joint, gtsam.Rot3.Yaw(np.pi / 2).matrix()[None])[0]
+    assert np.diag(turned) == pytest.approx(
+        [1, 9, 1, 1, 16, 1, 2, 3, 4, 5, 5, 5, 5, 5, 5]
+    )  # velocity is in nav already
+
+
+def test_covariance_of_all_keyframes_is_that_of_gtsam(solved):
+    graph = gtsam.NonlinearFactorGraph()
+    for _, factor in solved.factors:
+        graph.push_back(factor)
+    marginals = gtsam.Marginals(graph, solved.values)
+    for i in (0, 7, solved.indices[-1]):
+        R = solved.values.atPose3(key("X", i)).rotation().matrix()
+        body = marginals.marginalCovariance(key("X", i))
+        both = np.kron(np.eye(2), R)
+        assert solved.covariance[i, :6, :6] == pytest.approx(both @ body @ both.T, rel=1e-5, abs=1e-12)
+        assert solved.covariance[i, 9:, 9:] == pytest.approx(
+            marginals.marginalCovariance(key("B", i)), rel=1e-5, abs=1e-14
+        )
+
+
+def test_covariances_are_symmetric_and_positive(solved):
+    assert np.array_equal(solved.covariance, solved.covariance.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(solved.covariance).min() > 0.0
+
+
+def test_the_solution_is_stationary(solved):
+    """The gradient of the cost vanishes: an undamped step from the solution goes nowhere."""
+    graph = gtsam.NonlinearFactorGraph()
+    for _, factor in solved.factors:
+        graph.push_back(factor)
+    step = graph.linearize(solved.values).optimize()
+    assert np.abs(step.vector()).max() < 1e-4  # rad, m, m/s
+    assert solved.cost == pytest.approx(graph.error(solved.values)) and solved.converged
+
+
+def test_largest_difference(solved):
+    moved = gtsam.Values(solved.values)
+    i = solved.indices[3]
+    pose = moved.atPose3(key("X", i))
+    moved.update(key("X", i), pose.compose(gtsam.Pose3(gtsam.Rot3.Rx(np.radians(1e-3)), np.array([0.0, 0.03, 0.04]))))
+    other = room.Estimate(**{**vars_of(solved), "values": moved})
+    metres, degrees = room.largest_difference(solved, other)
+    assert metres == pytest.approx(0.05) and degrees == pytest.approx(1e-3, rel=1e-6)
+    assert room.largest_difference(solved, solved) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_largest_difference_near_half_a_turn(solved):
+    moved = gtsam.Values(solved.values)
+    name = key("X", solved.indices[0])
+    moved.update(name, moved.atPose3(name).compose(gtsam.Pose3(gtsam.Rot3.Rz(np.radians(179.0)), np.zeros(3))))
+    other = room.Estimate(**{**vars_of(solved), "values": moved})
+    assert room.largest_difference(solved, other)[1] == pytest.approx(179.0, abs=1e-6)
+
+
+def vars_of(estimate: room.Estimate) -> dict:
+    return {name: getattr(estimate, name) for name in estimate.__dataclass_fields__}
+
+
+def complaint() -> RuntimeError:
+    """GTSAM's own words about a pose without attitude."""
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.GPSFactor(key("X", 21), np.zeros(3), gtsam.noiseModel.Unit.Create(3)))
+    values = gtsam.Values()
+    values.insert(key("X", 21), gtsam.Pose3())
+    with pytest.raises(RuntimeError) as caught:
+        graph.linearize(values).optimize()
+    return caught.value
+
+
+def test_an_indeterminate_system_is_told_with_time_state_and_sensors():
+    error = room.indeterminate(complaint(), {21: 12_500_000_000}, 2_000_000_000, {21: {"imu", "gnss"}})
+    text = str(error)
+    assert text.startswith("t = 10.50 s: position or attitude is not determined there")
+    assert "keyframe 21, touched by gnss, imu" in text
+    assert "expected an absolute measurement nearby; add position fixes" in text and "--initial" in text
+
+
+@pytest.mark.parametrize(("letter", "name"), [("v", "velocity"), ("b", "an inertial bias"), ("x", "position")])
+def test_the_state_is_named(letter, name):
+    error = room.indeterminate(RuntimeError(f"near variable\n 123 (Symbol: {letter}4)"), {4: 0}, 0, {})
+    assert name in str(error) and "touched by nothing" in str(error)
+
+
+def test_another_complaint_keeps_its_words():
+    assert "Something else" in str(room.indeterminate(RuntimeError("Something else\nat length"), {}, 0, {}))
+
+
+@pytest.mark.parametrize("make", [room.chronological_order, room.dissection_order])
+def test_the_order_names_every_state_once(make):
+    steps = [Step(i, 0, 0.0) for i in range(11)]
+    steps[3].chain = {key("C", 3): np.zeros(3)}
+    order = make(steps)
+    names = [order.at(i) for i in range(order.size())]
+    expected = [key(letter, i) for letter in KEYFRAME_LETTERS for i in range(11)] + [key("C", 3)]
+    assert sorted(names) == sorted(expected)

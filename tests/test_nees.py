@@ -1,0 +1,136 @@
+"""Is the covariance honest? Average NEES over fixed seeds, against 99.8 % chi-square bounds (Bar-Shalom 2001, 5.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sessions import on_control, positions, recorded, truth, with_gnss
+
+import smartnav_graph as sn
+from smartnav_graph.evaluation.consistency import average_nees_bounds, nees
+from smartnav_graph.session import Session
+
+PARTS = {
+    "rotation": slice(0, 3),
+    "yaw": slice(2, 3),
+    "position": slice(3, 6),
+    "velocity": slice(6, 9),
+    "accel bias": slice(9, 12),
+    "gyro bias": slice(12, 15),
+}
+FRACTIONS = (0.1, 0.5, 0.9)
+
+
+def errors(session: Session, solution: sn.Solution, row: int) -> np.ndarray:
+    """True minus estimated state (15,) at one keyframe, in the order and axes of the covariance."""
+    R, p, v, bias = (part[0] for part in truth(session, solution.t_ns[row : row + 1]))
+    return np.concatenate(
+        [
+            Rotation.from_matrix(R @ solution.nav_R_body[row].T).as_rotvec(),
+            p - solution.nav_t_body[row],
+            v - solution.nav_v_body[row],
+            bias - np.r_[solution.accel_bias[row], solution.gyro_bias[row]],
+        ]
+    )
+
+
+def average_nees(make: Callable[[int], Session], seeds: int = 30) -> dict[tuple[str, float], float]:
+    """Mean NEES over the seeds, divided by its dimension, by part and fraction of the session."""
+    found: dict[tuple[str, float], list[float]] = {}
+    for seed in range(seeds):
+        session = make(seed)
+        solution = sn.smooth(session)
+        for fraction in FRACTIONS:
+            known = np.flatnonzero(np.isin(solution.t_ns, session.reference.t_ns))
+            row = int(known[round(fraction * (len(known) - 1))])
+            e, P = errors(session, solution, row), solution.covariance[row]
+            for name, part in PARTS.items():
+                one = nees(e[None, part], P[None, part, part])[0] / (part.stop - part.start)
+                found.setdefault((name, fraction), []).append(float(one))
+    return {which: float(np.mean(values)) for which, values in found.items()}
+
+
+def outside(averages: dict[tuple[str, float], float], seeds: int = 30) -> dict[tuple[str, float], float]:
+    """The averages that an honest covariance would not give."""
+    bad = {}
+    for (name, fraction), value in averages.items():
+        dof = PARTS[name].stop - PARTS[name].start
+        low, high = (bound / dof for bound in average_nees_bounds(dof, seeds, 0.998))
+        if not low <= value <= high:
+            bad[name, fraction] = value
+    return bad
+
+
+def control_only(seed: int) -> Session:
+    """No fixes, a surveyed point of 5 cm every five seconds."""
+    session = sn.simulate("figure-eight-60s", seed)
+    points = on_control(session, slice(0, None, 5), 0.05, seed)
+    return session.replace(gnss=None, sensors={}, control=points)
+
+
+def test_bounds_are_those_of_thirty_samples():
+    assert np.array(average_nees_bounds(3, 30, 0.998)) / 3 == pytest.approx([0.60, 1.52], abs=0.01)
+
+
+def test_fixes_alone():
+    assert outside(average_nees(lambda seed: sn.simulate("figure-eight-60s", seed))) == {}
+
+
+def test_control_points_alone():
+    assert outside(average_nees(control_only)) == {}
+
+
+def test_halved_sigmas_are_caught():
+    """Fixes that claim half their noise: the position is then four times as wrong as its covariance says."""
+
+    def bold(seed: int) -> Session:
+        session = recorded(seed=seed)
+        return with_gnss(session, sigma=session.gnss.sigma / 2)
+
+    bad = outside(average_nees(bold, 10), 10)
+    assert {("position", fraction) for fraction in FRACTIONS} <= set(bad)
+    assert min(bad["position", fraction] for fraction in FRACTIONS) > 2.0
+
+
+def test_halved_inertial_noise_is_caught():
+    def bold(seed: int) -> Session:
+        session = control_only(seed)
+        noise = session.calibration.imu_noise
+        less = replace(noise, **{name: getattr(noise, name) / 2 for name in noise.__dataclass_fields__})
+        return session.replace(calibration=replace(session.calibration, imu_noise=less))
+
+    assert len(outside(average_nees(bold, 10), 10)) >= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["phone-car-5min", "car-10min"])
+def test_long_drives(scenario):
+    """The phone's fixes wander by 4 m in a minute: its positions are as honest as those of white fixes."""
+    assert outside(average_nees(lambda seed: sn.simulate(scenario, seed))) == {}
+
+
+def test_dead_reckoning_grows_as_its_errors_do():
+    """30 recordings from a rest without any fix: RMS error over RMS sigma, horizontal and vertical.
+
+    Never optimistic. Early on pessimistic in the horizontal: a levelled start is off by its accelerometer bias, and
+    both errors cancel until the device turns; the prior takes them as independent.
+    """
+    at_s, squares, variances = (10.0, 25.0, 50.0), [], []
+    for seed in range(30):
+        session = recorded(seed=seed).replace(gnss=None)
+        solution = sn.smooth(session)
+        rows = np.searchsorted(solution.seconds, at_s)
+        off = solution.nav_t_body[rows] - positions(session, solution.t_ns[rows])
+        squares.append(off**2)
+        variances.append(solution.sigmas[rows, 3:6] ** 2)
+    ratio = np.sqrt(np.mean(squares, axis=0) / np.mean(variances, axis=0))  # (3 times, 3 axes)
+    low, high = (np.sqrt(bound) for bound in average_nees_bounds(1, 30, 0.998))
+    assert ratio.max() < high
+    assert (ratio[:, 2] > low).all()  # up: 15 m, 85 m, 320 m
+    assert (ratio[2, :2] > low / 2).all()  # after four turns: 200 m of 330 m
+    growth = np.sqrt(np.mean(variances, axis=0))
+    assert (growth[1] > 3 * growth[0]).all() and (growth[2] > 3 * growth[1]).all()

@@ -1,0 +1,102 @@
+"""What summary.json says of a run."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from sessions import on_control, recorded, with_gnss
+
+import smartnav_graph as sn
+from smartnav_graph.summary import peak_memory_mb, versions
+
+KEYS = {
+    *("mode", "duration_s", "path_m", "keyframes", "factors", "chi2_per_dof", "iterations", "converged", "states"),
+    *("timings_s", "real_time_factor", "peak_memory_mb", "gaps", "dropped", "rejected", "withheld", "initialisation"),
+    *("warnings", "versions"),
+}
+
+
+@pytest.fixture(scope="module")
+def eight():
+    return recorded()
+
+
+@pytest.fixture(scope="module")
+def summary(eight):
+    return sn.run(eight, withhold=("gnss:outage=40-45",)).summary
+
+
+def test_everything_promised_is_there_and_is_json(summary):
+    assert set(summary) >= KEYS
+    assert json.loads(json.dumps(summary)) == summary
+
+
+def test_counts(summary, eight):
+    assert summary["mode"] == "batch" and summary["keyframes"] == 61
+    assert summary["duration_s"] == pytest.approx(59.99)
+    assert summary["factors"] == {"prior": 3, "gnss": 55, "imu": 60, "imu_bias": 60}
+    assert summary["used"] == {"gnss": 55} and summary["withheld"]["gnss"]["count"] == 5
+    truth = np.linalg.norm(np.diff(eight.reference.enu, axis=0), axis=1).sum()
+    assert summary["path_m"] == pytest.approx(truth, rel=0.1)
+    assert summary["real_time_factor"] == pytest.approx(59.99 / summary["timings_s"]["total"], rel=0.01)
+
+
+def test_chi_square_is_one_where_the_noise_is_what_is_assumed():
+    """Mean over five seeds: 175 degrees of freedom of fixes each, so 1 +- 0.05 (one sigma)."""
+    found = [sn.run(recorded(seed=seed)).summary["chi2_per_dof"] for seed in range(5)]
+    assert np.mean([one["overall"] for one in found]) == pytest.approx(1.0, abs=0.2)
+    assert np.mean([one["gnss"] for one in found]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_chi_square_follows_the_sigmas(eight):
+    told = [
+        sn.run(with_gnss(eight, sigma=eight.gnss.sigma * factor)).summary["chi2_per_dof"]["gnss"]
+        for factor in (0.5, 1.0, 2.0)
+    ]
+    assert told[0] > 2.5 * told[1] and told[2] < told[1] / 2.5
+
+
+def test_a_misfit_is_told(eight, summary):
+    assert not any(text.startswith("solve:") for text in summary["warnings"])
+    bold = sn.run(with_gnss(eight, sigma=eight.gnss.sigma / 4)).summary
+    assert bold["chi2_per_dof"]["overall"] > 4.0
+    assert any("measurements contradict each other or their sigmas are too small" in text for text in bold["warnings"])
+
+
+def test_a_sigma_found_on_the_way_is_a_state(eight, summary):
+    """Fixes without sigmas and of 0.1 m, where the class default is 3 m."""
+    assert summary["states"] == {}
+    fine = recorded(white_m=0.1)
+    fine = with_gnss(fine.replace(calibration=None), sigma=None)
+    states = sn.run(fine).summary["states"]
+    found = states["gnss_sigma_m"]
+    assert found["held"] is False and found["sigma"] is None
+    assert found["value"][0] == pytest.approx(0.1, rel=0.5)
+
+
+def test_dead_reckoning_is_a_mode_of_its_own(eight):
+    summary = sn.run(eight.replace(gnss=None)).summary
+    assert summary["mode"] == "dead-reckoning" and summary["used"] == {}
+    assert summary["position_sigma_m"]["max"] > summary["position_sigma_m"]["median"]
+
+
+def test_control_points_count_as_absolute(eight):
+    session = eight.replace(gnss=None, sensors={}, control=on_control(eight, slice(0, None, 5), 0.05, 0))
+    summary = sn.run(session).summary
+    assert summary["mode"] == "batch" and summary["used"] == {"control": 12}
+    assert set(summary["chi2_per_dof"]) >= {"overall"}
+
+
+def test_initialisation_is_told(summary):
+    start = summary["initialisation"]
+    assert start["method"] == "static" and "rest of" in start["sentence"]
+    assert 0.0 <= start["heading_deg"] < 360.0 and 0.0 < start["sigma_heading_deg"] < 90.0
+    assert start["starts"] >= 1 and 0.0 < start["stretch_s"] <= 60.0
+
+
+def test_versions_and_memory():
+    assert {"python", "smartnav-graph", "gtsam", "numpy", "rerun-sdk"} <= set(versions())
+    assert versions()["gtsam"].startswith("4.3")
+    assert 30.0 < peak_memory_mb() < 20_000.0
