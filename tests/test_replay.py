@@ -125,6 +125,16 @@ def test_an_interrupt_before_there_is_anything_goes_through():
         estimate.replay(recorded(), configured("fixed-lag"), progress=interrupted)
 
 
+def test_a_heading_open_for_long_does_not_lengthen_the_delay():
+    """Batch looks at a minute of this recording for its start; a replay may look at 30 s."""
+    session = sn.simulate("figure-eight-60s")
+    assert sn.run(session).summary["initialisation"]["stretch_s"] > 45.0
+    config = configured("fixed-lag", polish=False)
+    whole, part = (sn.run(session, config, causal=True, end_s=end) for end in (None, 40.0))
+    assert whole.summary["delay_s"] <= 30.0
+    assert np.array_equal(part.causal.nav_t_body, whole.causal.nav_t_body[:41])
+
+
 def test_latency_and_delay_are_told():
     run = sn.run(recorded(), configured("fixed-lag", polish=False), causal=True)
     update = run.summary["update_ms"]
