@@ -162,8 +162,7 @@ def quiet_accel(imu: Imu) -> float | None:
     Quiet: on every axis accel varies by less than 0.4 m/s^2 and gyro by less than 0.05 rad/s (standard deviations),
     several times the noise of a phone at rest and less than any step or engine under load.
     """
-    every = max(1, round(0.02 / _period(imu)))  # 50 Hz is enough to see a step
-    imu = imu.take(slice(None, None, every)) if every > 1 else imu
+    imu = _thinned(imu)
     if len(imu) < 6:
         return None
     width = max(3, round(0.5 / _period(imu)))
@@ -177,6 +176,12 @@ def quiet_accel(imu: Imu) -> float | None:
 
     quiet = (spread(imu.accel) < 0.4) & (spread(imu.gyro) < 0.05)
     return float(np.median(np.linalg.norm(imu.accel[quiet], axis=1))) if quiet.sum() >= width else None
+
+
+def _thinned(imu: Imu) -> Imu:
+    """Every n-th row, to 50 Hz: enough to see a step or a turn."""
+    every = max(1, round(0.02 / _period(imu)))
+    return imu.take(slice(None, None, every)) if every > 1 else imu
 
 
 def _period(imu: Imu) -> float:
@@ -293,7 +298,7 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
 
 
-def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 120) -> dict[float, float] | None:
+def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
     """How far gravity turned by the gyro ends from the accelerometer's, for three units of the gyro.
 
     For windows at whose ends |accel| is near its median, the up direction a_0 (body axes) is carried through the
@@ -305,6 +310,7 @@ def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 120) -> dict[
     -------
     Median angle in degrees by s; None when fewer than ten windows qualify.
     """
+    imu = _thinned(imu)
     period = _period(imu)
     n = round(window_s / period)
     if n < 8 or len(imu) < 2 * n:
