@@ -47,6 +47,8 @@ class BatchConfig:
 HOLD_S = 10.0
 # A stretch that costs more than this a keyframe fits badly, and is solved again in parts that double from so many.
 BAD_COST = 2.5
+# A stretch that costs less than this a keyframe is a good enough guess as it is.
+GOOD_COST = 1.7
 GROW_FROM = 4
 # Turn (rad) that the gyro bias may add to a dead-reckoned guess.
 LARGEST_TURN = 0.1
@@ -150,7 +152,8 @@ class Batch:
 
     def _solve_stretch(self, stretch: Sequence[Step], values: Any, since: float) -> Solve:
         graph, order = self._stretch_graph(stretch, since), chronological_order(stretch)
-        return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate))
+        enough = 0.0 if self.unsure else GOOD_COST * len(stretch)
+        return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate), enough)
 
     def _grown(self, stretch: Sequence[Step], since: float) -> Solve:
         """Solve a stretch from its beginning in doubling parts, each foretold from the part before."""

@@ -66,8 +66,9 @@ def minimise(
     order: gtsam.Ordering,
     config: SolveConfig,
     shoot: Callable[[Any], Any] | None = None,
+    enough: float = 0.0,
 ) -> Solve:
-    """Levenberg-Marquardt with Gauss-Newton steps first.
+    """Levenberg-Marquardt with Gauss-Newton steps first; ends at once at a cost of `enough`.
 
     `shoot` replaces the states of a candidate by those its first state foretells. Where a step fails only because
     rotations far along the stretch turn on curves (an unknown gyro bias), the shot lands on the valley's floor.
@@ -97,7 +98,7 @@ def minimise(
                 return Solve(values, cost, iterations, _stationary(linear, order))
         small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
         flat = flat + 1 if cost - new_cost <= config.tolerance * max(new_cost, 1.0) else 0
-        converged = damping <= 1.0 and flat > 0 and (small or flat >= FLAT)
+        converged = new_cost <= enough or (damping <= 1.0 and flat > 0 and (small or flat >= FLAT))
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
     return Solve(values, cost, iterations, converged)
 
