@@ -8,8 +8,10 @@ for _ in range(passes):                       # replay: one, causal
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -85,8 +87,21 @@ def one_pass(
     smoother: Smoother, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory, problem: Problem
 ) -> None:
     """Every window through the smoother."""
-    for window in windows:
-        smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
+    with _no_collection():
+        for window in windows:
+            smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Pause Python's garbage collector: a pass makes thousands of small objects that stay, and no cycles."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
 
 
 def solve_passes(
@@ -168,7 +183,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
         magnetometer=session.magnetometer,
-        declination_deg=0.0,
+        declination_deg=0.0 if session.magnetometer is None else session.declination_deg,
         config=config,
     )
     return initialiser.run(solve, given)

@@ -101,6 +101,24 @@ def normal_gravity(lat_deg: float, height_m: float) -> float:
     return float(surface * (1 - 2 * (1 + f + m - 2 * f * s2) * h + 3 * h**2))
 
 
+def declination_deg(origin: Origin, year: float) -> float:
+    """Magnetic declination (deg, positive where the needle points east of north) at a decimal year.
+
+    World Magnetic Model 2025; outside its five years the secular variation is carried on (0.1 deg a year and less in
+    most places), which a phone's magnetometer cannot tell.
+    """
+    from pygeomag import GeoMag
+
+    field = GeoMag().calculate(
+        glat=origin.lat_deg,
+        glon=origin.lon_deg,
+        alt=origin.height_m / 1000.0,
+        time=year,
+        allow_date_outside_lifespan=True,
+    )
+    return float(field.d)
+
+
 def axis_vector(name: str) -> Floats:
     """Unit vector (3,) of a signed body axis such as ``+y`` or ``-z``.
 

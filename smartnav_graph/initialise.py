@@ -227,7 +227,7 @@ class Initialiser:
                     "initialisation",
                     "no absolute sensor (no position fix, no control point) and no rest at the start",
                     "position fixes, control points, or a device at rest for a second",
-                    'add a gnss, control or pose_fixes stream, or give --initial "e,n,u,heading_deg"',
+                    'add a gnss or control stream, or give --initial "e,n,u,heading_deg"',
                 )
             return self._dead_reckoning(rest)
         return self._search(solve, rest)

@@ -41,9 +41,10 @@ from smartnav_graph.streams import (
     Velocity,
     WheelSpeed,
 )
-from smartnav_graph.timebase import seconds_since
+from smartnav_graph.timebase import NS, seconds_since
 
 SCHEMA = 1
+GPS_EPOCH_S = 315_964_800
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
 
@@ -175,6 +176,15 @@ class Session:
         if self.origin is not None:
             return frames.normal_gravity(self.origin.lat_deg, self.origin.height_m)
         return frames.STANDARD_GRAVITY
+
+    @property
+    def declination_deg(self) -> float:
+        """Magnetic declination at the origin, deg; zero without one. The year is 2025 where the clock tells no date."""
+        if self.origin is None:
+            return 0.0
+        unix_s = self.t0_ns / NS + (GPS_EPOCH_S if self.clock_epoch == "gps" else 0.0)
+        year = 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
+        return frames.declination_deg(self.origin, year)
 
     def mount(self, sensor: str) -> Mount:
         """Where `sensor` sits; at the body origin when the session does not say."""

@@ -192,3 +192,9 @@ def test_vehicle_axes_are_forward_left_up():
 
 def test_angles_wrap_to_half_a_turn():
     np.testing.assert_allclose(frames.wrap_deg([0, 180, -180, 190, -190, 360, 725]), [0, -180, -180, -170, 170, 0, 5])
+
+
+def test_declination_is_that_of_the_published_test_values():
+    # WMM2025 test values (NOAA): 2025.0, height 0 km; 80 N 0 E: D = 1.28 deg; 0 N 120 E: D = -0.16 deg
+    assert frames.declination_deg(frames.Origin(80.0, 0.0, 0.0), 2025.0) == pytest.approx(1.28, abs=0.01)
+    assert frames.declination_deg(frames.Origin(0.0, 120.0, 0.0), 2025.0) == pytest.approx(-0.16, abs=0.01)
