@@ -215,23 +215,3 @@ def build_step(
     for builder in builders:
         builder.add(step, window, previous, memory)
     return step
-
-
-def nested_order(indices: Sequence[int]) -> list[int]:
-    """Keyframes in nested-dissection order of time: halves first, their separator last.
-
-    A chain eliminated so has a Bayes tree of logarithmic depth: joint marginals of all keyframes cost a quarter of
-    those after COLAMD, the solve the same.
-    """
-    order: list[int] = []
-    stack: list[tuple[int, int, bool]] = [(0, len(indices), False)]
-    while stack:
-        low, high, done = stack.pop()
-        if high <= low:
-            continue
-        middle = (low + high) // 2
-        if done or high - low == 1:
-            order.append(indices[middle])
-            continue
-        stack += [(low, high, True), (middle + 1, high, False), (low, middle, False)]
-    return order

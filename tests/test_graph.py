@@ -7,8 +7,6 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from smartnav_graph.graph import (
     KEYFRAME_LETTERS,
@@ -20,7 +18,6 @@ from smartnav_graph.graph import (
     Window,
     build_step,
     key,
-    nested_order,
 )
 from smartnav_graph.timebase import NS
 
@@ -77,30 +74,3 @@ def test_memory_knows_nothing_at_first_and_cannot_be_written():
     assert memory.is_rejected("gnss", 3) and not memory.is_rejected("gnss", 4) and not memory.is_rejected("control", 3)
     with pytest.raises(dataclasses.FrozenInstanceError):
         memory.phase = "robust"
-
-
-@given(st.integers(0, 300))
-def test_the_elimination_order_holds_every_keyframe_once(n):
-    assert sorted(nested_order(range(10, 10 + n))) == list(range(10, 10 + n))
-
-
-def depth_of(order: list[int]) -> int:
-    """Height of the elimination tree of a chain eliminated in this order."""
-    place = {node: i for i, node in enumerate(order)}
-    neighbours = {node: {m for m in (node - 1, node + 1) if m in place} for node in order}
-    parent: dict[int, int] = {}
-    for node in order:
-        later = {m for m in neighbours[node] if place[m] > place[node]}
-        if later:
-            parent[node] = min(later, key=place.__getitem__)
-            neighbours[parent[node]] |= later - {parent[node]}
-    heights = dict.fromkeys(order, 1)
-    for node in order:
-        if node in parent:
-            heights[parent[node]] = max(heights[parent[node]], heights[node] + 1)
-    return max(heights.values())
-
-
-def test_the_tree_of_a_chain_has_logarithmic_depth():
-    assert depth_of(list(range(1023))) == 1023  # in order of time
-    assert depth_of(nested_order(range(1023))) == 10

@@ -17,7 +17,7 @@ from smartnav_graph.smoothers.estimate import (
     Estimate,
     chronological_order,
     copy_state,
-    dissection_order,
+    eliminated,
     indeterminate,
     nav_covariances,
     state_at,
@@ -50,6 +50,8 @@ BAD_COST = 2.5
 # A stretch that costs less than this a keyframe is a good enough guess as it is.
 GOOD_COST = 1.7
 GROW_FROM = 4
+# Position variance (m^2) beyond which nothing holds the trajectory; minutes of dead reckoning reach 1e14.
+LARGEST_VARIANCE = 1e18
 # Turn (rad) that the gyro bias may add to a dead-reckoned guess.
 LARGEST_TURN = 0.1
 # Factor on the covariance that a settled stretch hands to the next: a linearised covariance is optimistic.
@@ -196,8 +198,7 @@ class Batch:
                 graph = WholeGraph(self.steps)
                 solve = minimise(graph, solve.values, order, self.solve)
             solved = time.perf_counter()
-            tree = _eliminate(graph.linearize(solve.values), dissection_order(self.steps))
-            covariance = nav_covariances(tree, solve.values, indices)
+            covariance = nav_covariances(eliminated(graph, solve.values, self.steps), self.steps, solve.values)
         except RuntimeError as error:
             raise self._explain(error) from error
         check_covariance(covariance, self.steps, self.t0_ns)
@@ -268,7 +269,7 @@ def _anchor(tree: Any, values: Any, step: Step) -> Any:
 
 
 def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None:
-    """Observability: every variance finite and positive, position known better than a planet is wide.
+    """Observability: every variance finite and positive, position known better than `LARGEST_VARIANCE`.
 
     Raises
     ------
@@ -276,7 +277,11 @@ def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None
         Names the first keyframe at fault.
     """
     variances = np.diagonal(covariance, axis1=1, axis2=2)
-    bad = ~np.isfinite(variances).all(axis=1) | (variances <= 0).any(axis=1) | (variances[:, 3:6] > 1e12).any(axis=1)
+    bad = (
+        ~np.isfinite(variances).all(axis=1)
+        | (variances <= 0).any(axis=1)
+        | (variances[:, 3:6] > LARGEST_VARIANCE).any(axis=1)
+    )
     if bad.any():
         step = steps[int(np.flatnonzero(bad)[0])]
         sensors = ", ".join(sorted(step.sensors())) or "nothing"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, Block, State, Step, Tag, key, nested_order
+from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, Block, State, Step, Tag, key
 
 Floats = NDArray[np.float64]
 
@@ -85,16 +85,7 @@ def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
 
 
 def chronological_order(steps: Sequence[Step]) -> gtsam.Ordering:
-    """Keyframes as they come: the cheapest solve of a chain."""
-    return _ordering(steps)
-
-
-def dissection_order(steps: Sequence[Step]) -> gtsam.Ordering:
-    """Keyframes by nested dissection of time: the cheapest marginals of a chain."""
-    return _ordering([steps[row] for row in nested_order(range(len(steps)))])
-
-
-def _ordering(steps: Sequence[Step]) -> gtsam.Ordering:
+    """Keyframes as they come: the cheapest elimination of a chain."""
     order = gtsam.Ordering()
     for step in steps:
         for name in step.names():
@@ -102,16 +93,60 @@ def _ordering(steps: Sequence[Step]) -> gtsam.Ordering:
     return order
 
 
-def nav_covariances(tree: Any, values: Any, indices: Sequence[int]) -> Floats:
-    """Joint covariance (n, 15, 15) of every keyframe from an eliminated graph, rotated to nav axes.
+def eliminated(graph: Any, values: Any, steps: Sequence[Step]) -> Any:
+    """Bayes net of a graph linearised at `values`, in chronological order; QR is exact where states are weakly held."""
+    return graph.linearize(values).eliminateSequential(chronological_order(steps), gtsam.EliminateQR)
 
-    GTSAM's pose covariance is [rotation, translation] in body axes (the tangent of a right retraction).
+
+def nav_covariances(net: Any, steps: Sequence[Step], values: Any) -> Floats:
+    """Joint covariance (n, 15, 15) of every keyframe from a chain eliminated in chronological order, in nav axes.
+
+    Each keyframe is conditioned on the next, R x_k + S x_k+1 = d; backwards in time
+    P_k = R^-1 R^-T + K P_k+1 K^T with K = R^-1 S. One small product a keyframe, and stable where nothing holds the
+    trajectory (a dead reckoning of minutes), where GTSAM's shortcuts of the Bayes tree give up.
+
+    Source: Rauch, Tung, Striebel (1965), in square-root information form (Bierman 1977, ch. X).
+
+    Raises
+    ------
+    RuntimeError
+        A keyframe is not determined.
     """
-    joint = np.empty((len(indices), 15, 15))
-    for row, index in enumerate(indices):
-        marginal = tree.jointMarginalCovariance([key(letter, index) for letter in KEYFRAME_LETTERS])
-        joint[row] = marginal.fullMatrix()
-    return to_nav_axes(joint, states_of(values, indices)[0])
+    conditionals = {net.at(i).keys()[0]: net.at(i) for i in range(net.size())}
+    joint = np.empty((len(steps), 15, 15))
+    later, later_at = np.zeros((0, 0)), dict[int, slice]()
+    for row in reversed(range(len(steps))):
+        at = _slices(steps[row])
+        size = max(part.stop for part in at.values())
+        R, S = np.zeros((size, size)), np.zeros((size, len(later)))
+        for name, part in at.items():
+            conditional = conditionals[name]
+            if conditional.R().shape != R[part, part].shape:
+                raise RuntimeError(f"(Symbol: {chr(gtsam.symbolChr(name))}{steps[row].index})")
+            R[part, part] = conditional.R()
+            rest, column = conditional.S(), 0
+            for parent in conditional.keys()[1:]:
+                block = at.get(parent) or later_at[parent]
+                width = block.stop - block.start
+                (R if parent in at else S)[part, block] = rest[:, column : column + width]
+                column += width
+        if not np.isfinite(R).all() or (np.diag(R) == 0.0).any():
+            raise RuntimeError(f"(Symbol: X{steps[row].index})")
+        inverse = np.linalg.inv(R)
+        gain = inverse @ S
+        later, later_at = inverse @ inverse.T + gain @ later @ gain.T, at
+        joint[row] = later[:15, :15]
+    return to_nav_axes(joint, states_of(values, [step.index for step in steps])[0])
+
+
+def _slices(step: Step) -> dict[int, slice]:
+    """Where each state of a step stands in its joint vector; pose, velocity and bias come first."""
+    at, start = {}, 0
+    for name in step.names():
+        size = STATES[chr(gtsam.symbolChr(name))].dim
+        at[name] = slice(start, start + size)
+        start += size
+    return at
 
 
 def to_nav_axes(joint: Floats, nav_R_body: Floats) -> Floats:

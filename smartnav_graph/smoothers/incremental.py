@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.graph import State, Step, key
-from smartnav_graph.smoothers.estimate import Estimate, dissection_order, indeterminate, nav_covariances, to_nav_axes
+from smartnav_graph.smoothers.estimate import Estimate, eliminated, indeterminate, nav_covariances, to_nav_axes
 from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
 
 Floats = NDArray[np.float64]
@@ -158,12 +158,11 @@ class Incremental:
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
         graph, values, indices = WholeGraph(steps), self.values(), [step.index for step in steps]
-        tree = graph.linearize(values).eliminateMultifrontal(dissection_order(steps), gtsam.EliminateQR)
         return Estimate(
             values=values,
             indices=indices,
             t_ns=np.array([step.t_ns for step in steps], dtype=np.int64),
-            covariance=nav_covariances(tree, values, indices),
+            covariance=nav_covariances(eliminated(graph, values, steps), steps, values),
             factors=[item for step in steps for item in step.factors],
             blocks=[block for step in steps for block in step.blocks],
             iterations=len(steps),

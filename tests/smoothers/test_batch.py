@@ -83,7 +83,7 @@ def test_without_anything_absolute_it_names_a_keyframe(problem, prior):
     assert "imu" in str(e.value) and "add position fixes" in str(e.value)
 
 
-@pytest.mark.parametrize("value", [np.nan, -1.0, np.inf, 1e13])
+@pytest.mark.parametrize("value", [np.nan, -1.0, np.inf, 1e19])
 def test_variances_that_cannot_be(problem, prior, value):
     batch = fill(problem, prior, Batch())
     covariance = np.tile(np.eye(15), (len(batch.steps), 1, 1))
