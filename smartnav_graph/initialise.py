@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from smartnav_graph import frames
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.factors.prior import UNKNOWN_ANGLE, PriorBuilder
+from smartnav_graph.factors.prior import REST_SPEED, UNKNOWN_ANGLE, PriorBuilder
 from smartnav_graph.first_seconds import Rest, find_rest, inertial_curve, kabsch_attitude
 from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.smoothers.estimate import Estimate
@@ -33,6 +33,8 @@ Floats = NDArray[np.float64]
 # a start must not look good because it rejects what contradicts it.
 GOOD_COST = 2.5
 REJECTION_COST = 10.0
+# Tilt (rad) that levelling by the accelerometer may be off.
+LEVELLED = 0.1
 KABSCH_S = (12.0, np.inf)
 
 
@@ -196,7 +198,7 @@ class Initialiser:
         if rest is not None:
             bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
-            velocity = np.full(3, 0.05)
+            velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
             start=state,
             sigma_rot=np.full(3, UNKNOWN_ANGLE),
@@ -205,6 +207,7 @@ class Initialiser:
             sigma_bias=bias,
             velocity_mean=np.zeros(3),
             bias_mean=mean,
+            rest_end_ns=None if rest is None else self.windows[0].t1_ns + int(rest.length_s * NS),
         )
         return replace(prior, **sigmas)
 
@@ -218,11 +221,10 @@ class Initialiser:
         """A held start: levelled by the accelerometer, position and heading as told."""
         up = self._level(rest)
         R = frames.nav_R_body_from_heading(heading_deg, up, self.forward)
-        tilt = max(self.noise.accel_bias_sigma / self.gravity, 0.002) if rest is not None else 0.1
         return self._prior(
             self._state(R, p, np.zeros(3), rest),
             rest,
-            sigma_rot=np.array([tilt, tilt, np.radians(sigma_deg)]),
+            sigma_rot=np.array([LEVELLED, LEVELLED, np.radians(sigma_deg)]),
             sigma_pos=np.full(3, sigma_m),
             **({} if rest is not None else {"sigma_vel": np.full(3, 10.0)}),
         )

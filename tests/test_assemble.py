@@ -58,7 +58,7 @@ def test_withheld_rows_beyond_the_keyframes_are_not_scored(eight):
 def test_residuals_are_there_for_every_factor(run):
     residuals = run.solution.residuals
     counts = {sensor: int(residuals.of(sensor).sum()) for sensor in sorted(set(residuals.sensor))}
-    assert counts == {"gnss": 3 * 60, "imu": 9 * 60, "imu_bias": 6 * 60}
+    assert counts == {"gnss": 3 * 60, "imu": 9 * 60, "imu_bias": 6 * 60, "rest": 3 * 5}
     assert np.isfinite(residuals.whitened).all() and residuals.used.all() and (residuals.weight == 1.0).all()
 
 

@@ -304,7 +304,7 @@ def test_a_rest_alone_starts_at_zero_and_says_so():
     np.testing.assert_array_equal(start.prior.start.nav.position(), 0.0)
     np.testing.assert_array_equal(start.prior.start.nav.velocity(), 0.0)
     np.testing.assert_allclose(start.prior.start.bias.gyroscope(), session.reference.gyro_bias[0], atol=2e-3)
-    np.testing.assert_allclose(start.prior.sigma_vel, 0.05)
+    np.testing.assert_allclose(start.prior.sigma_vel, 0.01)
 
 
 def test_neither_rest_nor_absolute_sensor_is_refused_with_the_way_out():
@@ -331,7 +331,7 @@ def test_a_given_start_is_levelled_and_held_as_told(resting):
     assert frames.heading_pitch_roll_deg(R)[0, 0] == pytest.approx(123.0, abs=1e-6)
     up = recording.truth([START_NS]).nav_R_body[0].T @ [0, 0, 1]
     assert np.degrees(np.arccos((R @ up)[2])) < (0.01 if resting else 12.0)
-    assert prior.sigma_vel.max() == (0.05 if resting else 10.0)
+    assert prior.sigma_vel.max() == (0.01 if resting else 10.0)
 
 
 # --- whole starts with the real solver --------------------------------------------------------------------------------

@@ -116,8 +116,8 @@ def test_long_drives(scenario):
 def test_dead_reckoning_grows_as_its_errors_do():
     """30 recordings from a rest without any fix: RMS error over RMS sigma, horizontal and vertical.
 
-    Never optimistic. Early on pessimistic in the horizontal: a levelled start is off by its accelerometer bias, and
-    both errors cancel until the device turns; the prior takes them as independent.
+    A levelled start is off by its accelerometer bias, and both errors cancel until the device turns: zero velocity
+    over the rest ties the one to the other.
     """
     at_s, squares, variances = (10.0, 25.0, 50.0), [], []
     for seed in range(30):
@@ -130,7 +130,6 @@ def test_dead_reckoning_grows_as_its_errors_do():
     ratio = np.sqrt(np.mean(squares, axis=0) / np.mean(variances, axis=0))  # (3 times, 3 axes)
     low, high = (np.sqrt(bound) for bound in average_nees_bounds(1, 30, 0.998))
     assert ratio.max() < high
-    assert (ratio[:, 2] > low).all()  # up: 15 m, 85 m, 320 m
-    assert (ratio[2, :2] > low / 2).all()  # after four turns: 200 m of 330 m
+    assert ratio.min() > low
     growth = np.sqrt(np.mean(variances, axis=0))
     assert (growth[1] > 3 * growth[0]).all() and (growth[2] > 3 * growth[1]).all()

@@ -36,7 +36,7 @@ def test_everything_promised_is_there_and_is_json(summary):
 def test_counts(summary, eight):
     assert summary["mode"] == "batch" and summary["keyframes"] == 61
     assert summary["duration_s"] == pytest.approx(59.99)
-    assert summary["factors"] == {"prior": 3, "gnss": 55, "imu": 60, "imu_bias": 60}
+    assert summary["factors"] == {"prior": 3, "rest": 5, "gnss": 55, "imu": 60, "imu_bias": 60}
     assert summary["used"] == {"gnss": 55} and summary["withheld"]["gnss"]["count"] == 5
     truth = np.linalg.norm(np.diff(eight.reference.enu, axis=0), axis=1).sum()
     assert summary["path_m"] == pytest.approx(truth, rel=0.1)

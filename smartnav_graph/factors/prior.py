@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
 UNKNOWN_PLACE = 1e5  # m
+REST_SPEED = 0.01  # m/s, of a device at rest
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class PriorBuilder:
     """Prior factors at the first keyframe.
 
     start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,
-    sigma_bias (6,) m/s^2 and rad/s around `bias_mean`.
+    sigma_bias (6,) m/s^2 and rad/s around `bias_mean`; rest_end_ns : end of a rest that begins at the first keyframe.
+    Zero velocity at its keyframes ties tilt to accelerometer bias: a levelled start is off by the one as the other is.
     """
 
     start: State
@@ -43,6 +45,7 @@ class PriorBuilder:
     sigma_bias: Floats
     velocity_mean: Floats
     bias_mean: gtsam.imuBias.ConstantBias
+    rest_end_ns: int | None = None
     name: str = "prior"
 
     def placed(self) -> PriorBuilder:
@@ -51,8 +54,11 @@ class PriorBuilder:
         return self if self.sigma_pos is not None else replace(self, sigma_pos=np.full(3, UNKNOWN_PLACE))
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
-        """Prior factors and initial values of the first keyframe; nothing later."""
+        """Prior factors and initial values of the first keyframe; later only zero velocity while the rest lasts."""
         if window.kind != "first":
+            if self.rest_end_ns is not None and window.t1_ns <= self.rest_end_ns:
+                still = gtsam.noiseModel.Isotropic.Sigma(3, REST_SPEED)
+                step.add(Tag("rest", window.t1_ns), gtsam.PriorFactorVector(key("V", window.index), np.zeros(3), still))
             return
         step.predicted, step.bias = self.start.nav, self.start.bias
         tag = Tag("prior", window.t1_ns)

@@ -32,6 +32,7 @@ SENSORS = {
     "control": ("Control points", "control point", "control points"),
     "pose_fixes": ("Pose fixes", "pose fix", "pose fixes"),
     "prior": ("Prior", "prior", "priors"),
+    "rest": ("Rest at the start", "zero velocity", "zero velocities"),
     "static": ("Standstills", "standstill", "standstills"),
     "magnetometer": ("Magnetometer", "magnetometer sample", "magnetometer samples"),
     "barometer": ("Barometer", "pressure sample", "pressure samples"),
