@@ -35,6 +35,8 @@ GOOD_COST = 2.5
 REJECTION_COST = 10.0
 # Tilt (rad) that levelling by the accelerometer may be off.
 LEVELLED = 0.1
+# Heading (rad) that iron nearby may turn a magnetometer by.
+MAGNETIC_SIGMA = 0.35
 KABSCH_S = (12.0, np.inf)
 
 
@@ -209,6 +211,11 @@ class Initialiser:
             bias_mean=mean,
             rest_end_ns=None if rest is None else self.windows[0].t1_ns + int(rest.length_s * NS),
         )
+        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
+        if rest is not None and magnetic is not None:
+            attitude = frames.nav_R_body_from_heading(magnetic, rest.accel, self.forward)
+            soft = np.array([UNKNOWN_ANGLE, UNKNOWN_ANGLE, MAGNETIC_SIGMA])
+            prior = replace(prior, attitude=gtsam.Rot3(attitude), sigma_rot=soft)
         return replace(prior, **sigmas)
 
     def _state(self, R: Floats, p: Floats, v: Floats, rest: Rest | None) -> State:
@@ -224,6 +231,7 @@ class Initialiser:
         return self._prior(
             self._state(R, p, np.zeros(3), rest),
             rest,
+            attitude=None,
             sigma_rot=np.array([LEVELLED, LEVELLED, np.radians(sigma_deg)]),
             sigma_pos=np.full(3, sigma_m),
             **({} if rest is not None else {"sigma_vel": np.full(3, 10.0)}),

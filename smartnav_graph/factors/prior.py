@@ -35,6 +35,7 @@ class PriorBuilder:
 
     start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,
     sigma_bias (6,) m/s^2 and rad/s around `bias_mean`; rest_end_ns : end of a rest that begins at the first keyframe.
+    attitude is the mean of the rotation prior, that of `start` where there is none of its own.
     Zero velocity at its keyframes ties tilt to accelerometer bias: a levelled start is off by the one as the other is.
     """
 
@@ -46,6 +47,7 @@ class PriorBuilder:
     velocity_mean: Floats
     bias_mean: gtsam.imuBias.ConstantBias
     rest_end_ns: int | None = None
+    attitude: gtsam.Rot3 | None = None
     name: str = "prior"
 
     def placed(self) -> PriorBuilder:
@@ -64,16 +66,22 @@ class PriorBuilder:
         tag = Tag("prior", window.t1_ns)
         x, v, b = (key(letter, window.index) for letter in "XVB")
         pose = self.start.nav.pose()
-        nav_R_body = pose.rotation().matrix()
+        attitude = pose.rotation() if self.attitude is None else self.attitude
+        nav_R_body = attitude.matrix()
         rot = nav_R_body.T @ np.diag(self.sigma_rot**2) @ nav_R_body
         if self.sigma_pos is None:
             model = gtsam.noiseModel.Gaussian.Covariance(rot)
-            step.add(tag, gtsam.PoseRotationPrior3D(x, pose, model))
+            step.add(tag, gtsam.PoseRotationPrior3D(x, attitude, model))
         else:
             cov = np.zeros((6, 6))
             cov[:3, :3] = rot
             cov[3:, 3:] = nav_R_body.T @ np.diag(self.sigma_pos**2) @ nav_R_body
-            step.add(tag, gtsam.PriorFactorPose3(x, pose, gtsam.noiseModel.Gaussian.Covariance(cov)))
+            step.add(
+                tag,
+                gtsam.PriorFactorPose3(
+                    x, gtsam.Pose3(attitude, pose.translation()), gtsam.noiseModel.Gaussian.Covariance(cov)
+                ),
+            )
         step.add(tag, gtsam.PriorFactorVector(v, self.velocity_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_vel)))
         step.add(
             tag,
