@@ -83,7 +83,7 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
     positions = {builder.name: builder for builder in position_builders(problem.builders)}
     for builder in positions.values():
         found = fix_residuals(builder, problem.windows, estimate, memory)
-        used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
+        used = memory.used(builder.name, found.rows)
         white = found.residual / found.sigma
         weight = np.where(used, _weights(builder, white), 0.0)
         parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))

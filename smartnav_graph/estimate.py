@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.assemble import Withheld, causal_solution, densify, score, to_solution
+from smartnav_graph.assemble import Withheld, causal_solution, densify, score, to_solution, used_counts
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
@@ -185,6 +185,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         magnetometer=session.magnetometer,
         declination_deg=0.0 if session.magnetometer is None else session.declination_deg,
         config=config,
+        weak=problem.config.prior,
     )
     return initialiser.run(solve, given)
 
@@ -247,10 +248,9 @@ def _finish(
 
 def _refuse_empty(problem: Problem, memory: Memory) -> None:
     """All fixes rejected is no solution."""
-    there = [b.name for b in problem.builders if b.name in ABSOLUTE]
-    counts = {name: sum(len(w.rows.get(name, ())) for w in problem.windows) for name in there}
-    if counts and all(len(memory.rejected.get(name, ())) >= count for name, count in counts.items()):
-        rows = ", ".join(f"{name} {count}" for name, count in counts.items())
+    counts = used_counts(problem, memory)
+    if counts and not any(counts.values()):
+        rows = ", ".join(f"{name} {len(memory.rejected.get(name, ()))}" for name in counts)
         raise SolverError(
             "solve",
             f"every absolute measurement was rejected ({rows})",

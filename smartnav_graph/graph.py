@@ -193,6 +193,10 @@ class Memory:
     def scale(self, group: str) -> float:
         return self.noise_scales.get(group, 1.0)
 
+    def used(self, sensor: str, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Mask of the rows (m,) of a sensor that are not rejected."""
+        return ~np.isin(rows, list(self.rejected.get(sensor, frozenset())))
+
     def is_rejected(self, sensor: str, row: int) -> bool:
         return row in self.rejected.get(sensor, frozenset())
 

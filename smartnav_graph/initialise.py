@@ -10,7 +10,7 @@ leave the heading open, the refinement is started from headings all round and th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from smartnav_graph import frames
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.factors.prior import REST_SPEED, UNKNOWN_ANGLE, PriorBuilder
+from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
 from smartnav_graph.first_seconds import Rest, find_rest, inertial_curve, kabsch_attitude
 from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.smoothers.estimate import Estimate
@@ -135,6 +135,7 @@ class Initialiser:
     magnetometer: Magnetometer | None
     declination_deg: float
     config: InitialiseConfig
+    weak: PriorConfig = field(default_factory=PriorConfig)
 
     def run(self, solve: Solve, given: Given | None) -> Initial:
         """The first state.
@@ -196,14 +197,14 @@ class Initialiser:
         noise = self.noise
         bias = np.array([noise.accel_bias_sigma] * 3 + [noise.gyro_bias_sigma] * 3)
         mean = gtsam.imuBias.ConstantBias()
-        velocity = np.full(3, 100.0)
+        velocity = np.full(3, self.weak.speed_sigma)
         if rest is not None:
             bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
             velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
             start=state,
-            sigma_rot=np.full(3, UNKNOWN_ANGLE),
+            sigma_rot=np.full(3, self.weak.angle_sigma),
             sigma_pos=None,
             sigma_vel=velocity,
             sigma_bias=bias,
@@ -214,7 +215,7 @@ class Initialiser:
         magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
         if rest is not None and magnetic is not None:
             attitude = frames.nav_R_body_from_heading(magnetic, rest.accel, self.forward)
-            soft = np.array([UNKNOWN_ANGLE, UNKNOWN_ANGLE, MAGNETIC_SIGMA])
+            soft = np.array([self.weak.angle_sigma, self.weak.angle_sigma, MAGNETIC_SIGMA])
             prior = replace(prior, attitude=gtsam.Rot3(attitude), sigma_rot=soft)
         return replace(prior, **sigmas)
 

@@ -65,7 +65,7 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
         if builder.name in memory.correlated:
             continue
         found = fix_residuals(builder, problem.windows, estimate, memory)
-        used = ~np.isin(found.rows, list(memory.rejected.get(builder.name, frozenset())))
+        used = memory.used(builder.name, found.rows)
         redundancy = float(np.clip(1.0 - found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0).sum())
         left -= redundancy
         if redundancy > 0.5:

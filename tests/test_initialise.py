@@ -17,6 +17,7 @@ from smartnav_graph.calibration.model import DEVICE_CLASSES
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.estimate import initialise
+from smartnav_graph.factors.prior import PriorConfig
 from smartnav_graph.initialise import (
     Given,
     InitialiseConfig,
@@ -366,3 +367,13 @@ def test_steady_travel_is_no_rest_where_fixes_say_otherwise():
     start = initialise(prepare(recording.session, Config()))
     assert start.method == "dynamic"
     np.testing.assert_allclose(np.linalg.norm(start.prior.start.nav.velocity()), 12.0, atol=0.5)
+
+
+def test_the_options_of_the_prior_take_effect():
+    session = simulate("car-10min").replace(reference=None)
+    config = Config(prior=PriorConfig(angle_sigma=0.5, speed_sigma=40.0))
+    prior = initialise(prepare(session, config)).prior
+    np.testing.assert_array_equal(prior.sigma_rot, 0.5)
+    np.testing.assert_array_equal(prior.sigma_vel, 40.0)
+    with pytest.raises(ConfigError, match="speed_sigma"):
+        PriorConfig(speed_sigma=0.0)

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.errors import ConfigError
 from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
 
 Floats = NDArray[np.float64]
@@ -27,6 +28,10 @@ class PriorConfig:
 
     angle_sigma: float = UNKNOWN_ANGLE
     speed_sigma: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not (self.angle_sigma > 0 and self.speed_sigma > 0):
+            raise ConfigError("config [prior]", "angle_sigma or speed_sigma <= 0", "> 0")
 
 
 @dataclass

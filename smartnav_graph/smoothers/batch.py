@@ -93,7 +93,7 @@ class Batch:
         """Take one step; settle the latest stretch when it is long enough."""
         self.steps.append(step)
         if self.warm is not None:
-            self._take_warm(step)
+            copy_state(step, self.warm, self.values)
             return
         new = step.values()
         self.values.insert(new)
@@ -103,9 +103,6 @@ class Batch:
             begin = time.perf_counter()
             self._settle(since)
             self._settle_s += time.perf_counter() - begin
-
-    def _take_warm(self, step: Step) -> None:
-        copy_state(step, self.warm, self.values)
 
     def _settle(self, since: float) -> None:
         """Solve the steps since the last settled one, held there by its marginals.
