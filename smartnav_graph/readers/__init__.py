@@ -10,7 +10,7 @@ from pathlib import Path
 
 from smartnav_graph import session
 from smartnav_graph.errors import SessionError
-from smartnav_graph.readers import comma2k19, csv_folder, euroc, gtsam_euroc, gtsam_kitti
+from smartnav_graph.readers import comma2k19, csv_folder, euroc, foot_dual_zupt, gtsam_euroc, gtsam_kitti, pyshoe
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import Session
@@ -22,6 +22,8 @@ READERS: dict[str, Reader] = {
         gtsam_euroc.READER,
         euroc.READER,
         comma2k19.READER,
+        foot_dual_zupt.READER,
+        pyshoe.READER,
         csv_folder.READER,
     )
 }

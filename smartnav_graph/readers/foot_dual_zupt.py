@@ -1,0 +1,111 @@
+"""The two foot-mounted IMUs of Constrained-ZUPT-FGO: one foot becomes one session.
+
+Hu, Hu (2025), Constrained factor graph optimization for robust networked pedestrian inertial navigation, IEEE/ION
+PLANS. 60 Hz, the clock is the row's index / 60 s. The positions are given with z down: (x, -y, -z) is the navigation
+frame. ``FOLDER#left`` and ``FOLDER#right`` are the whole recording of a foot, measData/imuMeasLeft.csv and
+imuMeasRight.csv its walk of 120 s.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.matlab import matrix, read_mat
+from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.text import first_lines, read_text
+from smartnav_graph.session import Device, Session
+from smartnav_graph.timebase import NS
+
+NAME = "foot-dual-zupt"
+RATE_HZ = 60
+NAV_FROM_FILE = np.array([1.0, -1.0, -1.0])
+FEET = ("left", "right")
+MATLAB = Path("dataPreparation")
+# In the whole recording: the inertial columns of a foot start here, and its positions stand in this file.
+FIRST_COLUMN = {"right": 0, "left": 6}
+POSITIONS = {"right": ("posFoot.mat", "posFoot"), "left": ("posLeft.mat", "posLeft")}
+HEADING = "time_index,acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z"
+WALKS = {"imuMeasLeft.csv": "left", "imuMeasRight.csv": "right"}
+
+Floats = NDArray[np.float64]
+
+
+def _split(source: str) -> tuple[Path, str]:
+    """Folder or file, and the foot named behind #."""
+    path, _, foot = source.partition("#")
+    return Path(path), foot
+
+
+def _matches(source: str) -> bool:
+    if "\0" in source:
+        return False
+    path, _ = _split(source)
+    if path.name in WALKS:
+        return any(line.startswith(HEADING) for line in first_lines(path, 1))
+    return (path / MATLAB / "ImuFootLeft.mat").is_file()
+
+
+def _read(source: str, repairs: tuple[str, ...]) -> Session:
+    path, foot = _split(source)
+    if path.name in WALKS:
+        foot, tables = WALKS[path.name], _walk(path)
+    elif foot in FEET:
+        tables = _whole(path / MATLAB, foot)
+    else:
+        found = f"names the foot {foot!r}" if foot else "holds two feet"
+        raise SessionError(source, found, "one foot", f"give {path}#left or {path}#right")
+    device = Device(name=f"foot-mounted IMU, {foot}", forward="+x", up="+z", vehicle="foot")
+    return build_session(tables, repairs, device=device, clock_epoch="unknown")
+
+
+def _whole(folder: Path, foot: str) -> dict[str, tuple[Path, Columns]]:
+    """The recording of 290 s."""
+    inertial, (name, variable) = folder / "ImuFootLeft.mat", POSITIONS[foot]
+    first = FIRST_COLUMN[foot]
+    rows = matrix(inertial, read_mat(inertial), "ImuFootLeft", first + 6)[:, first:]
+    position = matrix(folder / name, read_mat(folder / name), variable, 3, len(rows))
+    index = np.arange(len(rows))
+    return {"imu": (inertial, _imu(index, rows)), "reference": (folder / name, _reference(index, position))}
+
+
+def _walk(path: Path) -> dict[str, tuple[Path, Columns]]:
+    """The evaluated walk of 120 s; its clock starts anew."""
+    table = read_text(path)
+    table.require(HEADING.split(","))
+    rows = table.floats(*HEADING.split(",")[1:])
+    tables = {"imu": (path, _imu(table.floats("time_index"), rows))}
+    truth = path.with_name("positionGt.csv")
+    if truth.is_file():
+        positions = read_text(truth)
+        names = [f"pos_{WALKS[path.name]}_{axis}" for axis in "xyz"]
+        positions.require(["time_index", *names])
+        columns = _reference(positions.floats("time_index"), positions.floats(*names))
+        tables["reference"] = (truth, columns)
+    return tables
+
+
+def _times(index: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Nanoseconds of row numbers."""
+    return np.rint(np.asarray(index, dtype=np.float64) * (NS / RATE_HZ)).astype(np.int64)
+
+
+def _imu(index: NDArray[np.generic], rows: Floats) -> Columns:
+    t_ns = {"t_ns": _times(index)}
+    return t_ns | vector_columns("gyro_{}_rad_s", rows[:, 3:]) | vector_columns("accel_{}_m_s2", rows[:, :3])
+
+
+def _reference(index: NDArray[np.generic], position: Floats) -> Columns:
+    return {"t_ns": _times(index)} | vector_columns("{}_m", position * NAV_FROM_FILE, "enu")
+
+
+READER = Reader(
+    name=NAME,
+    summary="two foot-mounted IMUs, 60 Hz, foot positions; FOLDER#left, FOLDER#right",
+    recognised_by="a folder with dataPreparation/ImuFootLeft.mat, or imuMeasLeft.csv, imuMeasRight.csv",
+    matches=_matches,
+    read_source=_read,
+)

@@ -1,0 +1,61 @@
+"""MATLAB files (version 5) -> named arrays, with faults told by file and variable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import SessionError
+
+Floats = NDArray[np.float64]
+
+
+def names_in(path: Path) -> frozenset[str]:
+    """Names of the variables in a file; none where it is no MATLAB file."""
+    from scipy.io import whosmat
+
+    if path.suffix != ".mat" or not path.is_file():
+        return frozenset()
+    try:
+        return frozenset(str(row[0]) for row in whosmat(str(path), appendmat=False))
+    except (ValueError, OSError, NotImplementedError, TypeError):
+        return frozenset()
+
+
+def read_mat(path: Path) -> dict[str, Any]:
+    """The variables of a file.
+
+    Raises
+    ------
+    SessionError
+        Missing, unreadable, or no MATLAB file of version 5.
+    """
+    from scipy.io import loadmat
+
+    try:
+        return {name: value for name, value in loadmat(str(path), appendmat=False).items() if not name.startswith("__")}
+    except FileNotFoundError as error:
+        raise SessionError(path, "is missing", "a MATLAB file", "fetch the whole data set") from error
+    except (ValueError, OSError, NotImplementedError, TypeError) as error:
+        raise SessionError(path, f"cannot be read ({error})", "a MATLAB file of version 5") from error
+
+
+def matrix(path: Path, variables: dict[str, Any], name: str, width: int, rows: int | None = None) -> Floats:
+    """One variable as numbers (rows, width); rows of any count by default.
+
+    Raises
+    ------
+    SessionError
+        The variable is missing or of another shape.
+    """
+    if name not in variables:
+        there = ", ".join(sorted(variables))
+        raise SessionError(path, f"variable {name} is missing", f"one of shape (n, {width})", f"the file has {there}")
+    value = np.asarray(variables[name], dtype=np.float64)
+    if value.ndim != 2 or value.shape[1] < width or (rows is not None and len(value) != rows):
+        expected = f"({'n' if rows is None else rows}, {width})"
+        raise SessionError(path, f"{name} has shape {value.shape}", expected, "check the file's origin")
+    return value[:, :width]
