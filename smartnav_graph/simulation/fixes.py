@@ -1,4 +1,4 @@
-"""Errors of position fixes: white noise, a first-order Gauss-Markov process, outliers, outages; control points.
+"""Position fixes and their errors: white noise, Gauss-Markov process, outliers, outages; pose fixes; control points.
 
 Horizontal sigmas are per axis; the vertical ones are 1.5 times as large.
 """
@@ -6,15 +6,16 @@ Horizontal sigmas are per axis; the vertical ones are 1.5 times as large.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.frames import LocalFrame
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.streams import ControlPoint, GnssFix
+from smartnav_graph.streams import ControlPoint, GnssFix, PoseFix
 from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
@@ -48,7 +49,8 @@ class Outliers:
 @dataclass(frozen=True)
 class GnssModel:
     """A receiver: `rate_hz`, white sigma, Gauss-Markov sigma and correlation time, lever arm, outages (start s,
-    length s) and outliers."""
+    length s) and outliers; `velocity_m_s` > 0 is the sigma of velocities that come with the fixes; stamped t, a fix
+    speaks of the time t + `offset_s`."""
 
     rate_hz: float = 1.0
     white_m: float = 3.0
@@ -57,6 +59,20 @@ class GnssModel:
     body_t_antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     outages: tuple[tuple[float, float], ...] = ()
     outliers: Outliers | None = None
+    velocity_m_s: float = 0.0
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class PoseFixModel:
+    """Pose fixes every `every_s` seconds from `first_s` on, position sigma m and attitude sigma rad per axis (0: no
+    attitude), known `latency_s` after the time they speak of."""
+
+    every_s: float = 5.0
+    first_s: float = 2.0
+    sigma_m: float = 0.3
+    sigma_rad: float = 0.035
+    latency_s: float = 0.0
 
 
 def white(n: int, sigma: float, rng: np.random.Generator) -> Floats:
@@ -136,7 +152,31 @@ def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np
         enu = enu + errors
     sigma = np.tile(model.white_m * AXES, (n, 1))
     extra = {"is_outlier": mask.astype(np.int64)} if model.outliers is not None else {}
-    return GnssFix(t_ns=t_ns, lla=frame.lla_from_nav(enu), sigma=sigma, extra=extra)
+    fix = GnssFix(t_ns=t_ns, lla=frame.lla_from_nav(enu), sigma=sigma, extra=extra)
+    if model.velocity_m_s > 0:
+        arm = np.cross(truth.body_rate, model.body_t_antenna)
+        velocity = truth.nav_v_body + np.einsum("nij,nj->ni", truth.nav_R_body, arm)
+        velocity = velocity + white(n, model.velocity_m_s, rng)
+        fix = replace(fix, velocity=velocity, sigma_velocity=np.tile(model.velocity_m_s * AXES, (n, 1)))
+    return fix
+
+
+def pose_fixes(truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame, rng: np.random.Generator) -> PoseFix:
+    """Pose fixes of the body at `truth` (one row a fix): the attitude is Exp(error) nav_R_body, error in nav axes."""
+    n = len(t_ns)
+    enu = truth.nav_t_body + model.sigma_m * rng.standard_normal((n, 3))
+    turn = Rotation.from_rotvec(model.sigma_rad * rng.standard_normal((n, 3)))
+    fix = PoseFix(
+        t_ns=t_ns,
+        lla=frame.lla_from_nav(enu),
+        sigma=np.full((n, 3), model.sigma_m),
+        arrival_ns=t_ns + round(model.latency_s * NS) if model.latency_s else None,
+        source=np.full(n, "simulation", dtype=object),
+    )
+    if model.sigma_rad > 0:
+        quat = (turn * Rotation.from_matrix(truth.nav_R_body)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        fix = replace(fix, quat=quat, sigma_rot=np.full((n, 3), model.sigma_rad))
+    return fix
 
 
 def control(

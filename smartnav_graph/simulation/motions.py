@@ -24,17 +24,19 @@ def static(duration: float) -> Trajectory:
     return Trajectory(Legs([Leg(duration, 0.0)], heading_deg=40.0), held_deg=(0.0, 5.0, -3.0))
 
 
-def walk(duration: float, rng: np.random.Generator) -> Trajectory:
-    """A pedestrian, phone in front and pitched up 35 deg: 5 s rest, straights of 8 to 20 s at about 1.35 m/s, turns of
-    60 to 120 deg, and a rest of 4 to 8 s after every sixth turn on average."""
+def walk(
+    duration: float, rng: np.random.Generator, *, paces: tuple[float, float] = (1.2, 1.5), often: float = 1 / 6
+) -> Trajectory:
+    """A pedestrian, phone in front and pitched up 35 deg: 5 s rest, straights of 8 to 20 s at `paces` m/s, turns of
+    60 to 120 deg, and a rest of 4 to 8 s after a turn as `often` as that."""
     legs = [Leg(5.0, 0.0), Leg(1.5, 1.3)]
     while sum(leg.seconds for leg in legs) < duration:
-        pace = float(rng.uniform(1.2, 1.5))
+        pace = float(rng.uniform(*paces))
         legs += [
             Leg(float(rng.uniform(8, 20)), pace),
             Leg(2.5, pace, float(rng.choice([-1, 1]) * rng.uniform(60, 120))),
         ]
-        if rng.random() < 1 / 6:
+        if rng.random() < often:
             legs += [Leg(1.5, 0.0), Leg(float(rng.uniform(4, 8)), 0.0), Leg(1.5, pace)]
     heading = float(rng.uniform(0, 360))
     return Trajectory(Legs(legs, heading_deg=heading), held_deg=(0.0, 35.0, 4.0), sway=_STEPS, sway_speed=1.35)
@@ -55,6 +57,20 @@ def car(duration: float, rng: np.random.Generator, *, start_speed: float = 0.0) 
         legs.append(Leg(6.0, slow, turn))
     way = Legs(legs, speed=start_speed, heading_deg=float(rng.uniform(0, 360)))
     return Trajectory(way, sway=_SPRINGS, sway_speed=15.0)
+
+
+def slip(rng: np.random.Generator, sigma: float) -> tuple[Sway, ...]:
+    """Side and vertical speeds of `sigma` m/s each (root mean square at the sway speed) that no vehicle should have.
+
+    Three slow sines a direction with phases of their own: samples a second apart are nearly independent.
+    """
+    waves = []
+    for axis in (0, 2):
+        for hertz in (0.31, 0.37, 0.43):
+            shift = [0.0, 0.0, 0.0]
+            shift[axis] = sigma * np.sqrt(2.0 / 3.0) / (2 * np.pi * hertz)
+            waves.append(Sway(hertz, (shift[0], shift[1], shift[2]), phase=float(rng.uniform(0.0, 2 * np.pi))))
+    return tuple(waves)
 
 
 def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajectory:

@@ -1,13 +1,14 @@
 """Named simulated sessions with truth: the same type a reader gives, `reference` holding the exact states.
 
-The truth stands at 10 Hz and at every aiding epoch, on exact inertial stamps. All scenarios: 100 Hz inertial samples,
+The truth stands at 10 Hz and at every epoch of a fix, on exact inertial stamps. All scenarios: 100 Hz inertial samples,
 flat ENU frame at 52 N, 11 E, 100 m, gravity constant and straight down, no Earth rotation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +20,20 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.session import Device, Mount, Session
 from smartnav_graph.simulation import fixes, motions, sensors
-from smartnav_graph.simulation.fixes import GnssModel
-from smartnav_graph.simulation.sensors import PROFILES, Biases
+from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
+from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
-from smartnav_graph.streams import Reference, StaticPeriod
+from smartnav_graph.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 START_NS = 1_748_772_000 * NS  # 2025-06-01 10:00 UTC
 YEAR = 2025.41
 RATE_HZ = 100
-SLOW_ROWS = 10  # reference, magnetometer and barometer: every tenth inertial sample
+SLOW_ROWS = 10  # reference: every tenth inertial sample
+_OWN_EPOCHS = ("gnss", "control", "pose_fixes")
 CONTROL_SIGMA_M = 0.02
+SLIP_M_S = 0.15  # side and vertical speed of the phone's car at 15 m/s
 
 
 @dataclass(frozen=True)
@@ -44,49 +47,127 @@ class Scenario:
     profile: str = "mems"
     gnss: GnssModel | None = None
     control: bool = False
-    phone_sensors: bool = False
+    magnetometer: MagnetometerModel | None = None
+    barometer: BarometerModel | None = None
+    wheel: SpeedModel | None = None
+    velocity: SpeedModel | None = None
+    pose_fixes: PoseFixModel | None = None
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
         return _record(self, seed, calibrated)
 
 
+# Every purpose has random numbers of its own: a new sensor is added at the end and leaves the others as they were.
+PURPOSES = ("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes")
+
+
+@dataclass(frozen=True)
+class _Ride:
+    """One motion sampled at the inertial stamps, and the random numbers of every purpose."""
+
+    trajectory: Trajectory
+    t: NDArray[np.float64]
+    truth: Truth
+    seed: int
+    frame: LocalFrame
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        return START_NS + ns_from_seconds(self.t)
+
+    def rng(self, purpose: str) -> np.random.Generator:
+        return np.random.default_rng((self.seed, PURPOSES.index(purpose)))
+
+    def rows(self, rate_hz: float) -> slice:
+        """Every so many inertial samples."""
+        return slice(None, None, round(RATE_HZ / rate_hz))
+
+
 def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
-    rng_motion, rng_imu, rng_gnss, rng_control, rng_mag, rng_baro = (
-        np.random.default_rng((seed, purpose)) for purpose in range(6)
-    )
-    trajectory = scenario.motion(scenario.seconds, rng_motion)
+    trajectory = scenario.motion(scenario.seconds, np.random.default_rng((seed, 0)))
     t = np.arange(round(scenario.seconds * RATE_HZ)) / RATE_HZ
-    truth, t_ns = trajectory.sample(t), START_NS + ns_from_seconds(t)
-    frame, profile = LocalFrame(ORIGIN), PROFILES[scenario.profile]
-    imu, biases = sensors.imu(truth, t_ns, profile.noise, _gravity(), rng_imu)
-    session = Session(
+    ride = _Ride(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
+    profile = PROFILES[scenario.profile]
+    imu, biases = sensors.imu(ride.truth, ride.t_ns, profile.noise, _gravity(), ride.rng("imu"))
+    streams: dict[str, Stream | None] = {
+        "gnss": _gnss(ride, scenario.gnss),
+        "control": _control(ride) if scenario.control else None,
+        "pose_fixes": _pose_fixes(ride, scenario.pose_fixes),
+        **_slow_sensors(ride, scenario),
+    }
+    rows = [np.arange(0, len(t), SLOW_ROWS)]
+    rows += [np.searchsorted(ride.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
+    mounts = {} if scenario.gnss is None else {"gnss": Mount(body_t=scenario.gnss.body_t_antenna)}
+    return Session(
         device=Device(name=f"simulated {profile.name}", vehicle=scenario.vehicle),
         clock_epoch="unix",
         origin=ORIGIN,
+        sensors=mounts,
         calibration=_calibration(scenario) if calibrated else None,
         imu=imu,
-        static=_static(trajectory, t_ns),
+        static=_static(trajectory, ride.t_ns),
+        reference=reference(ride.truth, ride.t_ns, biases, np.unique(np.concatenate(rows))),
+        **streams,  # type: ignore[arg-type]
     )
-    rows = np.arange(0, len(t), SLOW_ROWS)
-    if scenario.gnss is not None:
-        model, every = scenario.gnss, slice(None, None, round(RATE_HZ / scenario.gnss.rate_hz))
-        fix = fixes.gnss(truth.take(every), t_ns[every], model, frame, rng_gnss)
-        session = session.replace(gnss=fix, sensors={"gnss": Mount(body_t=model.body_t_antenna)})
-        rows = np.union1d(rows, np.searchsorted(t_ns, fix.t_ns))
-    if scenario.control:
-        at = _stop_rows(trajectory, t)
-        names = [f"P{i}" for i in range(len(at))]
-        points = fixes.control(truth.take(at), t_ns[at], names, CONTROL_SIGMA_M, frame, rng_control)
-        session = session.replace(control=points)
-        rows = np.union1d(rows, at)
-    if scenario.phone_sensors:
-        slow = slice(None, None, SLOW_ROWS)
-        height = ORIGIN.height_m + truth.nav_t_body[slow, 2]
-        session = session.replace(
-            magnetometer=sensors.magnetometer(truth.take(slow), t_ns[slow], magnetic_field_ut(), rng_mag),
-            barometer=sensors.barometer(height, t_ns[slow], rng_baro),
+
+
+def _gnss(ride: _Ride, model: GnssModel | None) -> GnssFix | None:
+    if model is None:
+        return None
+    every = ride.rows(model.rate_hz)
+    truth, t_ns = ride.truth.take(every), ride.t_ns[every]
+    if model.offset_s:
+        spoken = ride.t[every] + model.offset_s
+        inside = (spoken >= 0.0) & (spoken <= ride.trajectory.duration)
+        truth, t_ns = ride.trajectory.sample(spoken[inside]), t_ns[inside]
+    return fixes.gnss(truth, t_ns, model, ride.frame, ride.rng("gnss"))
+
+
+def _control(ride: _Ride) -> ControlPoint:
+    at = _stop_rows(ride.trajectory, ride.t)
+    names = [f"P{i}" for i in range(len(at))]
+    rng = ride.rng("control")
+    return fixes.control(ride.truth.take(at), ride.t_ns[at], names, CONTROL_SIGMA_M, ride.frame, rng)
+
+
+def _pose_fixes(ride: _Ride, model: PoseFixModel | None) -> PoseFix | None:
+    if model is None:
+        return None
+    at = np.searchsorted(ride.t, np.arange(model.first_s, ride.t[-1], model.every_s) - 1e-9)
+    return fixes.pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
+
+
+def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:
+    """The streams that make no keyframes."""
+    made: dict[str, Stream] = {}
+    if (mag := scenario.magnetometer) is not None:
+        rows, rng = ride.rows(mag.rate_hz), ride.rng("magnetometer")
+        made["magnetometer"] = sensors.magnetometer(
+            ride.truth.take(rows),
+            ride.t_ns[rows],
+            magnetic_field_ut(),
+            rng,
+            hard_iron_sigma_ut=mag.hard_iron_sigma_ut,
+            sigma_ut=mag.sigma_ut,
+            disturbances=mag.disturbances,
         )
-    return session.replace(reference=reference(truth, t_ns, biases, rows))
+    if (baro := scenario.barometer) is not None:
+        rows, rng = ride.rows(baro.rate_hz), ride.rng("barometer")
+        made["barometer"] = sensors.barometer(
+            ORIGIN.height_m + ride.truth.nav_t_body[rows, 2],
+            ride.t_ns[rows],
+            rng,
+            offset_sigma_hpa=baro.offset_sigma_hpa,
+            sigma_hpa=baro.sigma_hpa,
+            walk_hpa=baro.walk_hpa,
+        )
+    if (model := scenario.wheel) is not None:
+        rows, rng = ride.rows(model.rate_hz), ride.rng("wheel")
+        made["wheel"] = sensors.wheel(ride.trajectory.speed(ride.t[rows]), ride.t_ns[rows], model, rng)
+    if (model := scenario.velocity) is not None:
+        rows, rng = ride.rows(model.rate_hz), ride.rng("velocity")
+        made["velocity"] = sensors.velocity(ride.truth.take(rows), ride.t_ns[rows], model, rng)
+    return made
 
 
 def _gravity() -> float:
@@ -161,21 +242,60 @@ def _eight(seconds: float, rng: np.random.Generator) -> Trajectory:
     return motions.figure_eight(seconds)
 
 
+def _car_with_phone(seconds: float, rng: np.random.Generator) -> Trajectory:
+    """A phone in a holder, turned by 3 deg in yaw and 2 deg in pitch, 1.2 m ahead of the rear axle, 0.5 m above it."""
+    car = motions.car(seconds, rng)
+    sway = (*car.sway, *motions.slip(rng, SLIP_M_S))
+    return replace(car, held_deg=(3.0, 2.0, 0.0), carried=(0.0, 1.2, 0.5), sway=sway)
+
+
+def _steady_walk(seconds: float, rng: np.random.Generator) -> Trajectory:
+    return motions.walk(seconds, rng, paces=(1.35, 1.35), often=1 / 3)
+
+
 _PHONE_GNSS = GnssModel(white_m=3.0, markov_m=4.0, markov_s=60.0)
 _CAR_GNSS = GnssModel(white_m=3.0, body_t_antenna=(0.1, -0.6, 0.9))
+_PHONE_SENSORS: dict[str, Any] = {"magnetometer": MagnetometerModel(), "barometer": BarometerModel()}
+# Everything a phone session may have, with noise as it is: hard iron not calibrated, pressure that walks, late fixes.
+_ALL_SENSORS: dict[str, Any] = {
+    "magnetometer": MagnetometerModel(hard_iron_sigma_ut=15.0),
+    "barometer": BarometerModel(walk_hpa=0.003),
+}
 
 SCENARIOS: dict[str, Scenario] = {
     s.name: s
     for s in (
-        Scenario("walk-60s", 60.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
-        Scenario("walk-10min", 600.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
+        Scenario("walk-60s", 60.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), **_PHONE_SENSORS),
+        Scenario("walk-10min", 600.0, motions.walk, "foot", "galaxy-s2", gnss=GnssModel(), **_PHONE_SENSORS),
         Scenario("car-10min", 600.0, motions.car, "car", gnss=_CAR_GNSS),
         Scenario("car-37min", 2220.0, motions.car, "car", gnss=_CAR_GNSS),
         Scenario("car-2h", 7200.0, motions.car, "car", gnss=_CAR_GNSS),
         Scenario("trolley-loop", 384.0, _trolley, "trolley", "galaxy-s2", control=True),
-        Scenario("static-60s", 60.0, _static_motion, "none", "galaxy-s2", gnss=GnssModel(), phone_sensors=True),
+        Scenario("static-60s", 60.0, _static_motion, "none", "galaxy-s2", gnss=GnssModel(), **_PHONE_SENSORS),
         Scenario("figure-eight-60s", 60.0, _eight, gnss=GnssModel(white_m=1.0)),
         Scenario("phone-car-5min", 300.0, _moving_car, "car", "galaxy-s2", gnss=_PHONE_GNSS),
+        Scenario(
+            "car-all-2min",
+            120.0,
+            _car_with_phone,
+            "car",
+            gnss=GnssModel(white_m=1.0, body_t_antenna=(0.1, -0.6, 0.9), velocity_m_s=0.1, offset_s=0.06),
+            wheel=SpeedModel(rate_hz=10.0, sigma_m_s=0.1),
+            pose_fixes=PoseFixModel(every_s=5.0, sigma_m=0.5, sigma_rad=0.05, latency_s=0.4),
+            control=True,
+            **_ALL_SENSORS,
+        ),
+        Scenario(
+            "walk-all-2min",
+            120.0,
+            _steady_walk,
+            "foot",
+            "galaxy-s2",
+            gnss=GnssModel(white_m=2.0, velocity_m_s=0.3),
+            pose_fixes=PoseFixModel(every_s=10.0, sigma_m=0.5, sigma_rad=0.05, latency_s=1.0),
+            control=True,
+            **_ALL_SENSORS,
+        ),
     )
 }
 

@@ -1,4 +1,4 @@
-"""What the sensors of a device read along an exact motion: inertial, magnetometer, barometer.
+"""What the sensors of a device read along an exact motion: inertial, magnetometer, barometer, wheel, velocity.
 
 Every sample is the true instantaneous quantity at its own stamp, plus bias and noise, as a real sensor gives it; it is
 no mean over the interval before or after. Whoever holds sample k constant over [t_k, t_k+1] therefore makes an error
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.frames import STANDARD_GRAVITY
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.streams import Barometer, Imu, Magnetometer
+from smartnav_graph.streams import Barometer, Imu, Magnetometer, Velocity, WheelSpeed
 from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
@@ -111,6 +111,38 @@ def imu(
     return Imu(t_ns=t_ns, gyro=gyro, accel=accel), biases
 
 
+@dataclass(frozen=True)
+class MagnetometerModel:
+    """A magnetometer: `rate_hz`, white sigma a sample, sigma of the constant hard iron (uT, body axes), disturbances.
+
+    A disturbance (start s, length s, size uT) is a horizontal field in a random direction that swells and fades as iron
+    is passed.
+    """
+
+    rate_hz: float = 10.0
+    sigma_ut: float = 0.5
+    hard_iron_sigma_ut: float = 1.0
+    disturbances: tuple[tuple[float, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class BarometerModel:
+    """A barometer: `rate_hz`, white sigma a sample hPa, sigma of the first offset hPa, and its walk hPa/sqrt(s)."""
+
+    rate_hz: float = 10.0
+    sigma_hpa: float = 0.03
+    offset_sigma_hpa: float = 1.0
+    walk_hpa: float = 0.0
+
+
+@dataclass(frozen=True)
+class SpeedModel:
+    """A wheel or velocity sensor: `rate_hz` and white sigma m/s (per axis)."""
+
+    rate_hz: float = 10.0
+    sigma_m_s: float = 0.05
+
+
 def magnetometer(
     truth: Truth,
     t_ns: Times,
@@ -119,11 +151,18 @@ def magnetometer(
     *,
     hard_iron_sigma_ut: float = 1.0,
     sigma_ut: float = 0.5,
+    disturbances: Sequence[tuple[float, float, float]] = (),
 ) -> Magnetometer:
-    """m = nav_R_body^T B + hard iron + white noise, uT; the hard iron is constant, drawn once."""
+    """m = nav_R_body^T (B + disturbance) + hard iron + white noise, uT; the hard iron is constant, drawn first."""
     hard_iron = hard_iron_sigma_ut * rng.standard_normal(3)
     field = np.einsum("nji,j->ni", truth.nav_R_body, nav_field_ut) + hard_iron
-    return Magnetometer(t_ns=t_ns, field_ut=field + sigma_ut * rng.standard_normal(field.shape))
+    field = field + sigma_ut * rng.standard_normal(field.shape)
+    for start, length, size in disturbances:
+        angle = rng.uniform(0.0, 2 * np.pi)
+        swell = size * np.sin(np.pi * np.clip((truth.t - start) / length, 0.0, 1.0)) ** 2
+        iron = swell[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
+        field = field + np.einsum("nji,nj->ni", truth.nav_R_body, iron)
+    return Magnetometer(t_ns=t_ns, field_ut=field)
 
 
 def standard_pressure(height_m: Floats) -> Floats:
@@ -132,9 +171,29 @@ def standard_pressure(height_m: Floats) -> Floats:
 
 
 def barometer(
-    height_m: Floats, t_ns: Times, rng: np.random.Generator, *, offset_sigma_hpa: float = 1.0, sigma_hpa: float = 0.03
+    height_m: Floats,
+    t_ns: Times,
+    rng: np.random.Generator,
+    *,
+    offset_sigma_hpa: float = 1.0,
+    sigma_hpa: float = 0.03,
+    walk_hpa: float = 0.0,
 ) -> Barometer:
-    """Standard pressure at `height_m` (n,) + a constant offset (the day's weather, the sensor) + white noise."""
+    """Standard pressure at `height_m` (n,) + an offset (the day's weather, the sensor) that walks + white noise."""
     offset = offset_sigma_hpa * rng.standard_normal()
     noise = sigma_hpa * rng.standard_normal(len(t_ns))
-    return Barometer(t_ns=t_ns, pressure_hpa=standard_pressure(height_m) + offset + noise)
+    steps = np.sqrt(np.diff(t_ns, prepend=t_ns[:1]) / NS) * rng.standard_normal(len(t_ns))
+    return Barometer(t_ns=t_ns, pressure_hpa=standard_pressure(height_m) + offset + noise + walk_hpa * np.cumsum(steps))
+
+
+def wheel(speed_m_s: Floats, t_ns: Times, model: SpeedModel, rng: np.random.Generator) -> WheelSpeed:
+    """Speed along the way (n,) m/s + white noise."""
+    sigma = np.full(len(t_ns), model.sigma_m_s)
+    return WheelSpeed(t_ns=t_ns, speed=speed_m_s + sigma * rng.standard_normal(len(t_ns)), sigma=sigma)
+
+
+def velocity(truth: Truth, t_ns: Times, model: SpeedModel, rng: np.random.Generator) -> Velocity:
+    """nav_R_body^T nav_v_body + white noise, m/s in body axes."""
+    body = np.einsum("nji,nj->ni", truth.nav_R_body, truth.nav_v_body)
+    sigma = np.full(body.shape, model.sigma_m_s)
+    return Velocity(t_ns=t_ns, velocity=body + sigma * rng.standard_normal(body.shape), sigma=sigma)

@@ -5,7 +5,8 @@ A motion is a ride along the body's own forward direction plus a sway::
     nav_R_way  = Rz(psi) Rx(slope)                        psi counter-clockwise from north about up
     velocity   = speed * nav_R_way e_y                    so a car's side and vertical speed are exactly zero
     nav_R_body = nav_R_way Rz(yaw) Rx(pitch) Ry(roll)     how the device is held
-    sway       = envelope * sum of sines, in level axes (right, ahead, up) and in the held angles
+    nav_t_body = way + carried                            where it sits, in level axes (right, ahead, up)
+    sway       = envelope * sum of sines, in level axes and in the held angles
 
 The envelope is speed / reference speed, so that whoever stands still does not sway. Speed, psi and slope are piecewise
 quintics, twice continuously differentiable; all derivatives are closed forms. Position is the integral of velocity by
@@ -148,12 +149,14 @@ class Sway:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A way, how the device is held on it (yaw, pitch, roll in degrees) and how it sways at `sway_speed` m/s."""
+    """A way, how the device is held on it (yaw, pitch, roll in degrees), how it sways at `sway_speed` m/s, and where it
+    is `carried` (m to the right, ahead, up of the point that follows the way)."""
 
     way: Way
     held_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sway: tuple[Sway, ...] = ()
     sway_speed: float = 1.0
+    carried: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def duration(self) -> float:
@@ -164,6 +167,10 @@ class Trajectory:
     def rests(self) -> tuple[tuple[float, float], ...]:
         """Standstills: start and end in seconds."""
         return self.way.rests
+
+    def speed(self, t: ArrayLike) -> Floats:
+        """Speed (n,) m/s along the way: what a wheel counts."""
+        return np.asarray(self.way(np.asarray(t, dtype=np.float64).reshape(-1))[0][:, 0])
 
     def sample(self, t: ArrayLike) -> Truth:
         """Exact states at the times `t` (n,) s.
@@ -199,7 +206,7 @@ class Trajectory:
     def _swayed(self, t: Floats, speed: Floats, speed1: Floats, speed2: Floats) -> tuple[list[Floats], list[Floats]]:
         """Shift and tilt, each as value, first and second derivative (n, 3)."""
         e, e1, e2 = (order / self.sway_speed for order in (speed, speed1, speed2))
-        shift = [np.zeros((len(t), 3)) for _ in range(3)]
+        shift = [np.zeros((len(t), 3)) + np.asarray(order) for order in (self.carried, 0.0, 0.0)]
         tilt = [np.zeros((len(t), 3)) + np.radians(self.held_deg), *(np.zeros((len(t), 3)) for _ in range(2))]
         for wave in self.sway:
             w = 2 * np.pi * wave.hertz

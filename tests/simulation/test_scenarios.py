@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import chi2
 
 from smartnav_graph import session
 from smartnav_graph.errors import ConfigError
@@ -12,6 +14,8 @@ from smartnav_graph.simulation import scenarios
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
 from smartnav_graph.timebase import NS
 
+# Force m/s^2, height m, field uT and pressure hPa of the first samples of walk-60s, seed 3.
+GOLDEN = [-0.4846241127340646, 95.72895993292332, -16.798879451632178, 1001.4255208012221]
 QUICK = [name for name in SCENARIOS if name not in ("car-37min", "car-2h")]
 
 
@@ -28,14 +32,17 @@ def nav_R_body(reference):
 def test_the_truth_stands_on_inertial_stamps_and_at_every_aiding_epoch(sessions, name):
     s = sessions[name]
     assert np.isin(s.reference.t_ns, s.imu.t_ns).all()
-    for stream in (s.gnss, s.control, s.magnetometer, s.barometer):
+    for stream in (s.gnss, s.control, s.pose_fixes, s.magnetometer, s.barometer, s.wheel, s.velocity):
         assert stream is None or np.isin(stream.t_ns, s.reference.t_ns).all()
     np.testing.assert_array_equal(np.diff(s.imu.t_ns), NS // 100)
     assert np.diff(s.reference.t_ns).max() == NS // 10
     np.testing.assert_allclose(np.linalg.norm(s.reference.quat, axis=1), 1.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in QUICK if SCENARIOS[name].gnss is not None])
+ON_TIME = [name for name in QUICK if SCENARIOS[name].gnss is not None and not SCENARIOS[name].gnss.offset_s]
+
+
+@pytest.mark.parametrize("name", ON_TIME)
 def test_fixes_scatter_round_the_antenna_as_their_sigma_says(sessions, name):
     s = sessions[name]
     rows = np.searchsorted(s.reference.t_ns, s.gnss.t_ns)
@@ -96,6 +103,75 @@ def test_the_batch_benchmark_has_its_size():
     s = simulate("car-37min", 0)
     assert len(s.imu) == 222_000 and len(s.gnss) == 2220
     assert s.device.vehicle == "car" and s.gnss.sigma[0, 0] == 3.0
+
+
+def test_recordings_of_old_scenarios_stay_what_they_were():
+    """Seeds name recordings: figures measured on them must not move when a sensor is added to the simulation."""
+    s = simulate("walk-60s", 3)
+    first = [s.imu.accel[0, 0], s.gnss.lla[0, 2], s.magnetometer.field_ut[0, 0], s.barometer.pressure_hpa[0]]
+    np.testing.assert_allclose(first, GOLDEN, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def late():
+    """A receiver whose clock is 0.06 s off, in a car."""
+    return SCENARIOS["car-all-2min"].gnss, simulate("car-all-2min", 3)
+
+
+def at(s, t_ns):
+    """Position, velocity and attitude of the truth at these stamps, interpolated over a tenth of a second."""
+    r = s.reference
+    t, own = (np.asarray(x - r.t_ns[0], dtype=float) for x in (t_ns, r.t_ns))
+    enu, v = (CubicSpline(own, rows)(t) for rows in (r.enu, r.velocity))
+    return enu, v, Slerp(own, Rotation.from_matrix(nav_R_body(r)))(t)
+
+
+def test_a_fix_speaks_of_a_time_later_by_the_offset(late):
+    model, s = late
+    fixes = s.nav_position(s.gnss)[:-1]
+    square = {}
+    for offset in (0.0, 0.06, 0.12):
+        p, _, R = at(s, s.gnss.t_ns[:-1] + round(offset * NS))
+        square[offset] = (((fixes - p - R.apply(model.body_t_antenna)) / s.gnss.sigma[:-1]) ** 2).mean()
+    assert square[0.06] == pytest.approx(1.0, abs=4 * np.sqrt(2 / (3 * len(fixes))))
+    assert square[0.06] < min(square[0.0], square[0.12])
+
+
+def test_velocities_are_the_antenna_s(late):
+    model, s = late
+    _, v, _ = at(s, s.gnss.t_ns[:-1] + round(model.offset_s * NS))
+    step = NS // 100
+    turning = [at(s, s.gnss.t_ns[1:-1] + round(model.offset_s * NS) + sign * step)[2] for sign in (-1, 1)]
+    rate = (turning[1].apply(model.body_t_antenna) - turning[0].apply(model.body_t_antenna)) / 0.02
+    white = (s.gnss.velocity[1:-1] - v[1:] - rate) / s.gnss.sigma_velocity[1:-1]
+    assert white.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * white.size))
+
+
+def test_wheels_count_the_way_and_not_the_phone_ahead_of_the_axle(late):
+    _, s = late
+    _, v, R = at(s, s.wheel.t_ns)
+    forward = Rotation.from_euler("ZX", [3.0, 2.0], degrees=True).inv().apply([0.0, 1.0, 0.0])
+    off = R.inv().apply(v) @ forward - s.wheel.speed
+    assert off.std() == pytest.approx(s.wheel.sigma[0], rel=0.1)
+    moving = s.wheel.speed > 5.0
+    sideways = (R.inv().apply(v) @ Rotation.from_euler("ZX", [3.0, 2.0], degrees=True).inv().apply([1.0, 0.0, 0.0]))[
+        moving
+    ]
+    turn = np.gradient(np.unwrap(R.as_euler("ZXY")[:, 0]), 0.1)[moving]
+    slope = np.polyfit(turn, sideways, 1)[0]
+    assert slope == pytest.approx(-1.2, abs=0.4)  # m ahead of the axle; sways of 0.1 m/s on top
+
+
+def test_pose_fixes_scatter_as_they_say_and_are_known_later(sessions):
+    s = sessions["walk-all-2min"]
+    fix = s.pose_fixes
+    np.testing.assert_array_equal(fix.arrival_ns - fix.t_ns, NS)
+    p, _, R = at(s, fix.t_ns)
+    white = (s.nav_position(fix) - p) / fix.sigma
+    turn = (Rotation.from_quat(fix.quat[:, [1, 2, 3, 0]]) * R.inv()).as_rotvec() / fix.sigma_rot
+    for rows in (white, turn):
+        low, high = chi2(rows.size).ppf([1e-3, 1 - 1e-3])
+        assert low < (rows**2).sum() < high
 
 
 def test_the_same_seed_gives_the_same_session_and_another_another():

@@ -100,3 +100,47 @@ def test_a_barometer_keeps_height_differences():
     reading = sensors.barometer(heights, T_NS[:5000], np.random.default_rng(3))
     slope = np.polyfit(heights, reading.pressure_hpa, 1)[0]
     assert slope == pytest.approx(-0.1189, abs=0.001)  # hPa a metre near 100 m
+
+
+def test_a_pressure_walks_with_its_density():
+    height = np.full(N, 100.0)
+    steady, walking = (
+        sensors.barometer(height, T_NS, np.random.default_rng(5), sigma_hpa=0.0, walk_hpa=walk).pressure_hpa
+        for walk in (0.0, 0.02)
+    )
+    assert np.ptp(steady) == 0.0 and walking[0] == steady[0]
+    for lag in (100, 1000):
+        steps = walking[lag::lag] - walking[:-lag:lag][: len(walking[lag::lag])]
+        assert steps.std() == pytest.approx(0.02 * np.sqrt(lag / 100), rel=4 / np.sqrt(2 * steps.size))
+
+
+def test_iron_on_the_way_disturbs_for_its_while_only():
+    field = np.array([0.0, 19.0, -45.0])
+    quiet, passed = (
+        sensors.magnetometer(rest(3000), T_NS[:3000], field, np.random.default_rng(6), disturbances=iron).field_ut
+        for iron in ((), ((10.0, 4.0, 25.0),))
+    )
+    extra = np.linalg.norm(passed - quiet, axis=1)
+    t = np.arange(3000) / 100
+    assert extra[(t < 10.0) | (t > 14.0)].max() < 1e-12 and np.abs((passed - quiet)[:, 2]).max() == 0.0
+    assert extra[1200] == pytest.approx(25.0)
+
+
+def test_wheel_and_velocity_sensors_scatter_as_they_say():
+    truth = motions.figure_eight(20.0).sample(np.arange(2000) / 100)
+    model = sensors.SpeedModel(sigma_m_s=0.2)
+    seen = sensors.velocity(truth, T_NS[:2000], model, np.random.default_rng(7))
+    off = np.einsum("nij,nj->ni", truth.nav_R_body, seen.velocity) - truth.nav_v_body
+    assert off.std() == pytest.approx(0.2, rel=4 / np.sqrt(2 * off.size))
+    counted = sensors.wheel(np.full(2000, 5.0), T_NS[:2000], model, np.random.default_rng(8))
+    assert counted.speed.mean() == pytest.approx(5.0, abs=4 * 0.2 / np.sqrt(2000)) and (counted.sigma == 0.2).all()
+
+
+def test_a_slipping_vehicle_has_the_side_speed_it_should_not_have():
+    rng = np.random.default_rng(9)
+    car = dataclasses.replace(motions.car(300.0, rng, start_speed=12.0), sway=motions.slip(rng, 0.15), sway_speed=12.0)
+    truth = car.sample(np.arange(0.0, 300.0, 0.1))
+    body = np.einsum("nji,nj->ni", truth.nav_R_body, truth.nav_v_body)
+    share = np.sqrt((car.speed(truth.t) ** 2).mean()) / 12.0
+    for axis in (0, 2):
+        assert body[:, axis].std() == pytest.approx(0.15 * share, rel=0.1)
