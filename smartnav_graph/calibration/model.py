@@ -41,6 +41,7 @@ class GnssNoise:
     horizontal_sigma, vertical_sigma : white part of fixes that carry no sigma of their own
     correlated_horizontal_sigma, correlated_vertical_sigma, correlated_time : first-order Gauss-Markov part of code
     receivers, m and s; zero sigma for a receiver whose errors do not wander
+    velocity_horizontal_sigma, velocity_vertical_sigma : m/s, of velocities that carry no sigma of their own
     """
 
     horizontal_sigma: float = 3.0
@@ -48,11 +49,28 @@ class GnssNoise:
     correlated_horizontal_sigma: float = 4.0
     correlated_vertical_sigma: float = 6.0
     correlated_time: float = 60.0
+    velocity_horizontal_sigma: float = 0.3
+    velocity_vertical_sigma: float = 0.5
 
     @property
     def wanders(self) -> bool:
         return self.correlated_horizontal_sigma > 0 and self.correlated_vertical_sigma > 0
 
+
+@dataclass(frozen=True)
+class VehicleNoise:
+    """Speeds (m/s) that a vehicle on wheels should not have and has: sideways, up, and of its wheels over the road."""
+
+    lateral_sigma: float
+    vertical_sigma: float
+    wheel_sigma: float
+
+
+# One default a vehicle on wheels. Castors follow the push, and a trolley's load rocks, at a tenth of a car's speed.
+VEHICLE_CLASSES: dict[str, VehicleNoise] = {
+    "car": VehicleNoise(lateral_sigma=0.15, vertical_sigma=0.15, wheel_sigma=0.1),
+    "trolley": VehicleNoise(lateral_sigma=0.1, vertical_sigma=0.05, wheel_sigma=0.05),
+}
 
 # One default a device class, the same for every recording.
 DEVICE_CLASSES: dict[str, ImuNoise] = {
