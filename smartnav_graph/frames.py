@@ -101,11 +101,11 @@ def normal_gravity(lat_deg: float, height_m: float) -> float:
     return float(surface * (1 - 2 * (1 + f + m - 2 * f * s2) * h + 3 * h**2))
 
 
-def declination_deg(origin: Origin, year: float) -> float:
-    """Magnetic declination (deg, positive where the needle points east of north) at a decimal year.
+def magnetic_field_ut(origin: Origin, year: float) -> Floats:
+    """Flux density (3,) uT of the Earth's field, ENU, at a decimal year.
 
-    World Magnetic Model 2025; outside its five years the secular variation is carried on (0.1 deg a year and less in
-    most places), which a phone's magnetometer cannot tell.
+    World Magnetic Model 2025; outside its five years the secular variation is carried on (0.1 deg and 0.1 uT a year and
+    less in most places), which a phone's magnetometer cannot tell.
     """
     from pygeomag import GeoMag
 
@@ -116,7 +116,13 @@ def declination_deg(origin: Origin, year: float) -> float:
         time=year,
         allow_date_outside_lifespan=True,
     )
-    return float(field.d)
+    return np.array([field.y, field.x, -field.z]) / 1000.0
+
+
+def declination_deg(origin: Origin, year: float) -> float:
+    """Magnetic declination (deg, positive where the needle points east of north) at a decimal year."""
+    east, north, _ = magnetic_field_ut(origin, year)
+    return float(np.degrees(np.arctan2(east, north)))
 
 
 def axis_vector(name: str) -> Floats:

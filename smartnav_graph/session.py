@@ -178,13 +178,22 @@ class Session:
         return frames.STANDARD_GRAVITY
 
     @property
-    def declination_deg(self) -> float:
-        """Magnetic declination at the origin, deg; zero without one. The year is 2025 where the clock tells no date."""
-        if self.origin is None:
-            return 0.0
+    def year(self) -> float:
+        """Decimal year of time zero; 2025 where the clock tells no date."""
         unix_s = self.t0_ns / NS + (GPS_EPOCH_S if self.clock_epoch == "gps" else 0.0)
-        year = 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
-        return frames.declination_deg(self.origin, year)
+        return 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
+
+    @cached_property
+    def magnetic_field_ut(self) -> NDArray[np.float64] | None:
+        """The Earth's field (3,) uT, ENU, at the origin; None without one."""
+        return None if self.origin is None else frames.magnetic_field_ut(self.origin, self.year)
+
+    @property
+    def declination_deg(self) -> float:
+        """Magnetic declination at the origin, deg; zero without one."""
+        if self.magnetic_field_ut is None:
+            return 0.0
+        return float(np.degrees(np.arctan2(*self.magnetic_field_ut[:2])))
 
     def mount(self, sensor: str) -> Mount:
         """Where `sensor` sits; at the body origin when the session does not say."""

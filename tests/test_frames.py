@@ -198,3 +198,13 @@ def test_declination_is_that_of_the_published_test_values():
     # WMM2025 test values (NOAA): 2025.0, height 0 km; 80 N 0 E: D = 1.28 deg; 0 N 120 E: D = -0.16 deg
     assert frames.declination_deg(frames.Origin(80.0, 0.0, 0.0), 2025.0) == pytest.approx(1.28, abs=0.01)
     assert frames.declination_deg(frames.Origin(0.0, 120.0, 0.0), 2025.0) == pytest.approx(-0.16, abs=0.01)
+
+
+def test_the_magnetic_field_is_that_of_the_published_test_values():
+    # WMM2025 test values, 2025.0, height 0: X, Y, Z in nT at 80 N, 0 E and at 0 N, 120 E
+    for origin, (x, y, z) in (
+        (frames.Origin(80.0, 0.0, 0.0), (6521.6, 145.9, 54791.5)),
+        (frames.Origin(0.0, 120.0, 0.0), (39677.8, -109.6, -10580.2)),
+    ):
+        expected = np.array([y, x, -z]) / 1000.0  # north, east, down -> ENU
+        np.testing.assert_allclose(frames.magnetic_field_ut(origin, 2025.0), expected, atol=1e-3)

@@ -188,10 +188,7 @@ def _calibration(scenario: Scenario) -> Calibration:
 
 def magnetic_field_ut() -> NDArray[np.float64]:
     """World Magnetic Model at the scenarios' origin and date, (3,) uT in ENU."""
-    from pygeomag import GeoMag
-
-    field = GeoMag().calculate(glat=ORIGIN.lat_deg, glon=ORIGIN.lon_deg, alt=ORIGIN.height_m / 1000.0, time=YEAR)
-    return np.array([field.y, field.x, -field.z]) / 1000.0
+    return frames.magnetic_field_ut(ORIGIN, YEAR)
 
 
 def _within(trajectory: Trajectory, end: float) -> list[tuple[float, float]]:
