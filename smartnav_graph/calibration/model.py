@@ -72,6 +72,30 @@ VEHICLE_CLASSES: dict[str, VehicleNoise] = {
     "trolley": VehicleNoise(lateral_sigma=0.1, vertical_sigma=0.05, wheel_sigma=0.05),
 }
 
+
+@dataclass(frozen=True)
+class BarometerNoise:
+    """pressure_sigma : hPa, white, a sample; pressure_walk : hPa/sqrt(s), weather, draughts and the sensor itself."""
+
+    pressure_sigma: float = 0.03
+    pressure_walk: float = 0.003
+
+
+@dataclass(frozen=True)
+class StepNoise:
+    """What is known of a walker before the first step.
+
+    factor : metres of a step over the fourth root of the swing of the specific force (m/s^2), with its sigma;
+    sideways_sigma : the same across the forward axis of the device, zero on average; step_sigma : m/sqrt(s), by which
+    steps that share one factor differ
+    """
+
+    factor: float = 0.45
+    factor_sigma: float = 0.15
+    sideways_sigma: float = 0.1
+    step_sigma: float = 0.2
+
+
 # One default a device class, the same for every recording.
 DEVICE_CLASSES: dict[str, ImuNoise] = {
     # Consumer MEMS in phones and loggers, used in motion: about five times the white noise of a device at rest, to
@@ -88,6 +112,31 @@ DEVICE_CLASSES: dict[str, ImuNoise] = {
 
 
 @dataclass(frozen=True)
+class MagnetometerNoise:
+    """Errors of a magnetometer, uT: reading = nav_R_body^T (field + disturbance) + hard iron + white, before soft iron.
+
+    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : what iron nearby adds to the Earth's field as the
+    device moves, and how long it stays alike
+    hard_iron_ut : constant offset in body axes, hard_iron_sigma_ut : how sure; that of a phone whose system calibrates
+    soft_iron : row-major (3, 3), the corrected reading is soft_iron (reading - hard iron)
+    """
+
+    sigma_ut: float = 0.5
+    disturbance_ut: float = 3.0
+    disturbance_s: float = 2.0
+    hard_iron_ut: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hard_iron_sigma_ut: float = 15.0
+    soft_iron: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        numbers = (*self.hard_iron_ut, *self.soft_iron, self.sigma_ut, self.disturbance_ut, self.disturbance_s)
+        positive = min(self.sigma_ut, self.disturbance_s, self.hard_iron_sigma_ut) > 0 and self.disturbance_ut >= 0
+        if not (all(map(math.isfinite, numbers)) and positive and len(self.soft_iron) == 9):
+            expected = "finite numbers, sigmas > 0, the nine of soft_iron"
+            raise CalibrationError("calibration.toml", f"{self}", expected, "give uT and s")
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Device calibration as it stands in calibration.toml."""
 
@@ -95,9 +144,12 @@ class Calibration:
     device_class: str = "mems"
     imu_noise: ImuNoise = field(default_factory=lambda: DEVICE_CLASSES["mems"])
     gnss_noise: GnssNoise = field(default_factory=GnssNoise)
+    barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
+    step_noise: StepNoise = field(default_factory=StepNoise)
+    magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
 
     def __post_init__(self) -> None:
-        for room in (self.imu_noise, self.gnss_noise):
+        for room in (self.imu_noise, self.gnss_noise, self.barometer_noise, self.step_noise):
             for f in dataclasses.fields(room):
                 value = getattr(room, f.name)
                 may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
