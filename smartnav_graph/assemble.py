@@ -17,10 +17,13 @@ from smartnav_graph.prediction import Kinematics, states_at
 from smartnav_graph.problem import Problem
 from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.whole_graph import Stack, loss_weights
 from smartnav_graph.solution import Residuals, Solution
-from smartnav_graph.timebase import interpolate, ns_from_seconds
+from smartnav_graph.timebase import NS, interpolate, ns_from_seconds
 
 Floats = NDArray[np.float64]
+# Stamps (m,), sensor, whitened residuals (m, d), weight (m,), used (m,).
+Part = tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def causal_solution(problem: Problem, states: Sequence[State]) -> Solution:
 
 def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals:
     """Whitened residuals of every factor, and of rejected rows."""
-    parts: list[tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]] = []
+    parts: list[Part] = []
     positions = {builder.name: builder for builder in position_builders(problem.builders)}
     for builder in positions.values():
         found = fix_residuals(builder, problem.windows, estimate, memory)
@@ -87,6 +90,8 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
         white = found.residual / found.sigma
         weight = np.where(used, _weights(builder, white), 0.0)
         parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))
+    for sensor in sorted({block.sensor for block in estimate.blocks} - set(positions)):
+        parts += [_of_stack(stack, estimate) for stack in estimate.stacks(sensor)]
     native: dict[str, tuple[list[int], list[Floats]]] = {}
     for tag, factor in estimate.factors:
         if tag.sensor not in positions and isinstance(factor, gtsam.NoiseModelFactor) and tag.sensor != "prior":
@@ -101,6 +106,13 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
     return _flat(parts)
 
 
+def _of_stack(stack: Stack, estimate: Estimate) -> Part:
+    white, _ = stack.linearize(estimate.values)
+    t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys], dtype=np.int64)
+    weight = np.where(stack.used, loss_weights((white**2).sum(axis=1), stack.loss)[0], 0.0)
+    return t_ns, stack.blocks[0].sensor, white, weight, stack.used
+
+
 def _weights(builder: PositionBuilder, white: Floats) -> Floats:
     """Robust weights (n,) of the loss in force."""
     if builder.config.loss != "huber":
@@ -108,7 +120,7 @@ def _weights(builder: PositionBuilder, white: Floats) -> Floats:
     return np.asarray(np.minimum(1.0, 1.345 / np.maximum(np.linalg.norm(white, axis=1), 1e-12)))
 
 
-def _flat(parts: Sequence[tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]]) -> Residuals:
+def _flat(parts: Sequence[Part]) -> Residuals:
     """One row a scalar."""
     if not parts:
         return Residuals.empty()
@@ -132,17 +144,22 @@ def _kinematics(solution: Solution) -> Kinematics:
     return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
 
 
-def score(problem: Problem, keyframes: Solution) -> dict[str, Withheld]:
-    """Withheld rows against the smoothed prediction at their own time, through their sensor's lever arm."""
+def score(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str, Withheld]:
+    """Withheld rows against the smoothed prediction through their sensor's model: at its time offset, with its lever
+    arm. A sensor with offset tau speaks of IMU time t + tau; beyond the ends the velocity carries on."""
     scored = {}
     for name, stream in problem.withheld.items():
         inside = (stream.t_ns >= keyframes.t_ns[0]) & (stream.t_ns <= keyframes.t_ns[-1])
         rows = stream.take(inside)
         if not len(rows):
             continue
-        there = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, rows.t_ns)
+        t_ns = rows.t_ns + round(estimate.offset_s(name) * NS)
+        known = np.clip(t_ns, keyframes.t_ns[0], keyframes.t_ns[-1])
+        there = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, known)
         lever = np.asarray(problem.session.mount(name).body_t)
-        scored[name] = Withheld(rows.t_ns, there.p + there.R @ lever - problem.session.nav_position(rows))
+        lever = lever + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
+        p = there.p + there.v * ((t_ns - known) / NS)[:, None] + there.R @ lever
+        scored[name] = Withheld(rows.t_ns, p - problem.session.nav_position(rows))
     return scored
 
 

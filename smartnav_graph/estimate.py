@@ -24,7 +24,7 @@ from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph import Builder, Memory, State, Window, build_step
+from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.problem import Problem, prepare
 from smartnav_graph.revise import position_builders, revise
@@ -136,11 +136,12 @@ def solve_passes(
         if clock is not None:
             _account(clock, estimate, problem.builders)
         learnt, done = revise(problem.builders, windows, estimate, memory)
-        if done or count == most or (unsure and learnt.correlated):
+        if done or count == most or (unsure and learnt.stage > memory.stage):
             return estimate, memory, count
         # Least squares bent by outliers is no start for a redescending loss: settled stretch by stretch it stays near
         # the truth, and a burst stands out against what is foretold.
-        warm = None if learnt.phase == "robust" and not unsure else estimate.values
+        cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
+        warm = None if cold else estimate.values
         memory = learnt
     raise AssertionError("unreachable")
 
@@ -239,7 +240,7 @@ def _finish(
     causal: Solution | None = None,
 ) -> Run:
     keyframes = to_solution(problem, estimate, memory)
-    withheld = score(problem, keyframes)
+    withheld = score(problem, keyframes, estimate)
     solution = densify(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(problem, initial, estimate, memory, keyframes, withheld, clock.to_dict(), extra)
@@ -276,7 +277,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     smoother = Incremental(options, problem.session.t0_ns)
     builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
-    memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering)
+    memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering, stage=LAST_STAGE)
     latency: list[float] = []
     states: list[State] = []
     interrupted = False

@@ -19,31 +19,79 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StateKind:
-    """One row of the state table. scope: ``keyframe`` (one a keyframe), ``chain`` (one an epoch of its sensor),
-    ``session`` (one a session)."""
+    """One row of the state table.
+
+    scope : ``keyframe`` (one a keyframe), ``chain`` (one a keyframe, where its sensor has it), ``session`` (one)
+    trust (dim,) : step that a damping of one holds the state to
+    moved (dim,) : step that moves its linearisation point in replay
+    """
 
     letter: str
     name: str
     dim: int
     scope: str
+    trust: Floats
+    moved: Floats
 
 
+def _kind(letter: str, name: str, scope: str, trust: Sequence[float], moved: Sequence[float]) -> StateKind:
+    return StateKind(letter, name, len(trust), scope, np.array(trust), np.array(moved))
+
+
+# Only rotations, biases and what multiplies them make the factors nonlinear.
 STATES: dict[str, StateKind] = {
     kind.letter: kind
     for kind in (
-        StateKind("X", "pose", 6, "keyframe"),
-        StateKind("V", "velocity", 3, "keyframe"),
-        StateKind("B", "imu bias", 6, "keyframe"),
-        StateKind("C", "gnss correlated error", 3, "chain"),
+        _kind("X", "pose", "keyframe", [0.3] * 3 + [100.0] * 3, [0.005] * 3 + [0.1] * 3),
+        _kind("V", "velocity", "keyframe", [10.0] * 3, [0.1] * 3),
+        _kind("B", "imu bias", "keyframe", [0.3] * 3 + [0.02] * 3, [0.01] * 3 + [0.001] * 3),
+        _kind("C", "gnss correlated error", "chain", [10.0] * 3, [1.0] * 3),
+        _kind("D", "barometer bias", "chain", [10.0], [1.0]),
+        _kind("T", "time offset", "session", [0.3], [0.01]),
+        _kind("L", "lever arm", "session", [1.0] * 3, [0.05] * 3),
+        _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),
+        _kind("M", "vehicle mount", "session", [0.3] * 2 + [1.0] * 4 + [0.1] * 2, [0.01] * 2 + [0.1] * 4 + [1e-3] * 2),
+        _kind("W", "wheel scale and delay", "session", [0.1, 0.3], [0.005, 0.01]),
+        _kind("H", "hard iron", "session", [30.0] * 3, [1.0] * 3),
+        _kind("K", "step factor", "session", [0.3] * 2, [0.02] * 2),
+        _kind("S", "inertial scale and misalignment", "session", [0.03] * 18, [0.003] * 18),
     )
 }
 KEYFRAME_LETTERS = tuple(kind.letter for kind in STATES.values() if kind.scope == "keyframe")
+# A session state's index is its sensor's place here.
+SENSORS = (
+    *("imu", "gnss", "control", "pose_fixes", "velocity", "wheel", "vehicle", "magnetometer", "barometer", "steps"),
+    *("images", "tracks", "matches"),
+)
+
+
+def kind_of(name: int) -> StateKind:
+    """Row of the state table behind a GTSAM key."""
+    return STATES[chr(gtsam.symbolChr(name))]
 
 
 @lru_cache(maxsize=1 << 18)
 def key(letter: str, index: int) -> int:
     """GTSAM key of a state."""
     return int(gtsam.symbol(letter, index))
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """One state for the whole session, with its prior.
+
+    name : as in summary.json, with its unit (``gnss_time_offset_s``); initial (d,), sigma (d,) of the prior
+    """
+
+    letter: str
+    sensor: str
+    name: str
+    initial: Floats
+    sigma: Floats
+
+    @property
+    def key(self) -> int:
+        return key(self.letter, SENSORS.index(self.sensor))
 
 
 @dataclass(frozen=True)
@@ -68,6 +116,7 @@ class Window:
     dt (m,) s, accel (m, 3) m/s^2, gyro (m, 3) rad/s : inertial intervals, means over each interval, borders
     interpolated; the force is given in body axes at the interval's start
     rows : row indices of each aiding stream at t1
+    late : rows that speak of an earlier time and became known in this window
     """
 
     index: int
@@ -78,10 +127,20 @@ class Window:
     accel: Floats
     gyro: Floats
     rows: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
+    late: Mapping[str, Sequence[LateRow]] = field(default_factory=dict)
 
     @property
     def length_s(self) -> float:
         return (self.t1_ns - self.t0_ns) / 1e9
+
+
+@dataclass(frozen=True)
+class LateRow:
+    """A row of a stream that arrived after the window it speaks of: `t_ns` lies in `window`."""
+
+    row: int
+    t_ns: int
+    window: Window
 
 
 @dataclass(frozen=True)
@@ -114,12 +173,26 @@ class RowModel(Protocol):
 
 @dataclass(frozen=True)
 class Block:
-    """m rows of one `RowModel`: keys (m, k), data (m, q). One pass in batch, a CustomFactor a row in replay."""
+    """m rows of one `RowModel` at one time: keys (m, k), data (m, q). One pass in batch, CustomFactors in replay.
+
+    rows : row of the stream behind each, -1 where there is none; used : False keeps a row out of the solve, its
+    residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row
+    """
 
     sensor: str
     model: RowModel
     keys: Sequence[tuple[int, ...]]
     data: Floats
+    t_ns: int
+    rows: Sequence[int] = ()
+    used: Sequence[bool] = ()
+    loss: str = "none"
+
+    def __post_init__(self) -> None:
+        if not self.rows:
+            object.__setattr__(self, "rows", (-1,) * len(self.keys))
+        if not self.used:
+            object.__setattr__(self, "used", (True,) * len(self.keys))
 
 
 @dataclass
@@ -129,6 +202,8 @@ class Step:
     predicted : state at t1 that the inertial data foretell; variance (3,) of its position m^2, where known
     foretell : (nav, bias) at t0 -> nav at t1, for states that have moved since
     refresh : bias at t0 -> the inertial factor linearised there, None while the present one is good enough
+    chain : initial values of the chain states at this keyframe; session : session states that something here touches;
+    constants : those that are held, held : their values, by key
     """
 
     index: int
@@ -142,6 +217,20 @@ class Step:
     factors: list[tuple[Tag, Any]] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
     chain: dict[int, Floats] = field(default_factory=dict)
+    session: dict[int, SessionState] = field(default_factory=dict)
+    held: dict[int, Floats] = field(default_factory=dict)
+    constants: dict[int, SessionState] = field(default_factory=dict)
+
+    def use(self, state: SessionState) -> int:
+        """Key of a session state that a factor of this step touches."""
+        self.session[state.key] = state
+        return state.key
+
+    def hold(self, values: Mapping[str, Floats]) -> None:
+        """Make constants of the session states named in `values`."""
+        self.constants |= {name: state for name, state in self.session.items() if state.name in values}
+        self.held = {name: np.asarray(values[state.name]) for name, state in self.constants.items()}
+        self.session = {name: state for name, state in self.session.items() if name not in self.held}
 
     def add(self, tag: Tag, factor: Any) -> None:
         """Add one native factor."""
@@ -181,6 +270,9 @@ class Memory:
     noise_scales : factor on the class-default sigma by group name
     rejected : rows not used, by sensor
     correlated : sensors whose errors are known to wander, and get a Gauss-Markov state
+    held : session states that stay at a value (d,), by name
+    stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
+    constraints, time offsets, magnetometer, steps)
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``gated`` (least squares
     without them), ``causal`` (replay: least squares, a redescending loss where a fix contradicts the prediction)
     """
@@ -188,6 +280,8 @@ class Memory:
     noise_scales: Mapping[str, float] = field(default_factory=dict)
     rejected: Mapping[str, frozenset[int]] = field(default_factory=dict)
     correlated: frozenset[str] = frozenset()
+    held: Mapping[str, Floats] = field(default_factory=dict)
+    stage: int = 0
     phase: str = "plain"
 
     def scale(self, group: str) -> float:
@@ -201,10 +295,14 @@ class Memory:
         return row in self.rejected.get(sensor, frozenset())
 
 
+LAST_STAGE = 1
+
+
 class Builder(Protocol):
-    """Adds the factors of one sensor to a step."""
+    """Adds the factors of one sensor to a step, from its `stage` on."""
 
     name: str
+    stage: int
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Add this sensor's factors for `window`; `previous` is the latest state (None at the first keyframe)."""
@@ -217,5 +315,7 @@ def build_step(
     """The step of one window: every builder in turn."""
     step = Step(window.index, window.t1_ns, (window.t1_ns - t_origin_ns) / 1e9)
     for builder in builders:
-        builder.add(step, window, previous, memory)
+        if builder.stage <= memory.stage:
+            builder.add(step, window, previous, memory)
+    step.hold(memory.held)
     return step

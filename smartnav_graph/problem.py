@@ -12,7 +12,8 @@ from smartnav_graph import health
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
+from smartnav_graph.factors import ABSOLUTE, BUILDERS
+from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder, Window
 from smartnav_graph.keyframes import keyframe_times, make_windows
 from smartnav_graph.session import Session
@@ -75,7 +76,8 @@ def prepare(session: Session, config: Config) -> Problem:
     times = keyframe_times(span, list(aiding.values()), gaps, config.keyframes)
     windows = make_windows(imu, times, gaps, aiding, config.keyframes)
     calibration = session.calibration or Calibration()
-    context = FactorContext(session, calibration, gaps, config.imu, config.gnss, config.control)
+    vehicle = config.run.vehicle or session.device.vehicle
+    context = FactorContext(session, calibration, gaps, vehicle, config)
     builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}

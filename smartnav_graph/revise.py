@@ -2,20 +2,24 @@
 
 Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
 and rows inside the gate are let in again. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
-with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6).
+with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6). What needs the
+trajectory found first (time offsets, vehicle constraints, wandering errors) joins when nothing is left to learn
+without it; session states that the data do not determine are held at their calibrated value.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from smartnav_graph.factors.gnss import PositionBuilder
-from smartnav_graph.graph import Builder, Memory, Window, key
+from smartnav_graph.factors.observation import turned
+from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
 from smartnav_graph.smoothers.estimate import Estimate
 
 Floats = NDArray[np.float64]
@@ -25,7 +29,10 @@ LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
-MEDIAN_CHI2_3 = float(chi2(3).median())
+
+
+# A session state is held where the data leave more than this of its prior sigma.
+OBSERVED = 0.7
 
 
 @dataclass(frozen=True)
@@ -54,20 +61,81 @@ def fix_residuals(
     pairs = [(k, int(row)) for k, w in enumerate(windows) for row in w.rows.get(builder.name, ())]
     keyframe = np.array([k for k, _ in pairs], dtype=np.intp)
     rows = np.array([row for _, row in pairs], dtype=np.intp)
-    R, p, _, _ = estimate.states()
-    residual = p[keyframe] + R[keyframe] @ builder.lever - builder.position[rows]
+    sigma = builder.scaled_sigma(memory)[rows]
+    R, p, v, bias = (x[keyframe] for x in estimate.states())
+    delay = estimate.offset_s(builder.name)
+    measured = [builder.force(windows[k], *at) for k, *at in zip(keyframe, R, bias, strict=True)]
+    a = turned(R, np.array(measured).reshape(-1, 3) - bias[:, :3])
+    a[:, 2] -= builder.gravity
+    lever = builder.lever + estimate.session_value(f"{builder.name}_lever_arm_correction_m", 3)
+    residual = p + v * delay + 0.5 * a * delay**2 + R @ lever - builder.position[rows]
     if builder.name in memory.correlated:
         residual += np.array([estimate.values.atVector(key("C", estimate.indices[k])) for k in keyframe]).reshape(-1, 3)
     posterior = np.diagonal(estimate.covariance[keyframe][:, 3:6, 3:6], axis1=1, axis2=2)
-    return FixResiduals(rows, keyframe, residual, builder.scaled_sigma(memory)[rows], posterior)
+    return FixResiduals(rows, keyframe, residual, sigma, posterior)
 
 
 def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
     return [builder for builder in builders if isinstance(builder, PositionBuilder)]
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """How one sensor's rows stand at the estimate: rows (m,), normalised squares (m,) and a gate over them."""
+
+    name: str
+    rows: NDArray[np.intp]
+    square: Floats
+    dim: int
+    gate: Callable[[Floats, float, float | None], NDArray[np.bool_]]
+
+    def outside(self, probability: float | None = None) -> frozenset[int]:
+        """Rows beyond the gate, at the robust level of all rows."""
+        level = float(np.median(self.square)) / float(chi2(self.dim).median())
+        return frozenset(int(row) for row in self.rows[self.gate(self.square, level, probability)])
+
+
+def verdicts(
+    builders: Iterable[Builder], found: Mapping[str, FixResiduals], estimate: Estimate, memory: Memory
+) -> list[Verdict]:
+    """Every sensor whose outliers are looked for: positions, and whatever declares a `gate_probability`."""
+    result = []
+    for builder in builders:
+        if isinstance(builder, PositionBuilder):
+            if builder.config.loss == "gate" and builder.name in found:
+                result.append(_position_verdict(builder, found[builder.name], memory))
+        elif getattr(builder, "gate_probability", None):
+            result += _block_verdict(builder, estimate)
+    return result
+
+
+def _position_verdict(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Verdict:
+    square = ((found.residual / builder.scaled_sigma(memory)[found.rows]) ** 2).sum(axis=1)
+
+    def gate(square: Floats, level: float, probability: float | None) -> NDArray[np.bool_]:
+        return builder.gate(square, level, found.rows, probability)
+
+    return Verdict(builder.name, found.rows, square, 3, gate)
+
+
+def _block_verdict(builder: Any, estimate: Estimate) -> list[Verdict]:
+    stacks = estimate.stacks(builder.name)
+    if not stacks:
+        return []
+    white = [stack.linearize(estimate.values)[0] for stack in stacks]
+    square = np.concatenate([(rows**2).sum(axis=1) for rows in white])
+    dim = white[0].shape[1]
+
+    def gate(square: Floats, level: float, probability: float | None) -> NDArray[np.bool_]:
+        limit = float(chi2(dim).ppf(probability or builder.gate_probability)) * max(1.0, level)
+        return np.asarray(square > limit)
+
+    rows = np.array([row for stack in stacks for block in stack.blocks for row in block.rows], dtype=np.intp)
+    return [Verdict(builder.name, rows, square, dim, gate)]
+
+
 def revise(
-    builders: Iterable[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory
+    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory
 ) -> tuple[Memory, bool]:
     """The memory for the next pass, and whether there is nothing more to learn."""
     found = {b.name: (b, fix_residuals(b, windows, estimate, memory)) for b in position_builders(builders)}
@@ -75,27 +143,41 @@ def revise(
     new = memory
     for builder, residuals in found.values():
         new = _rescaled(builder, residuals, new)
-    gated = [(b, r) for b, r in found.values() if b.config.loss == "gate"]
-    if memory.phase == "plain" and any(_outside(b, r, new, 1.0 - SURPRISE / len(r.rows)) for b, r in gated):
+    judged = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
+    if memory.phase == "plain" and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
         return replace(new, phase="robust"), False
-    outliers = {b.name: _outside(b, r, new) for b, r in gated}
+    outliers = {v.name: v.outside() for v in judged}
     if memory.phase == "robust":
         return replace(new, phase="gated", rejected=outliers), False
     if memory.phase == "gated":
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < 0.1 for name in found)
-    done = steady and new.rejected == memory.rejected
-    wandering = frozenset(b.name for b, _ in found.values() if b.wanders(new))
-    if done and wandering != memory.correlated:
-        return replace(new, correlated=wandering), False
-    return new, done
+    if not (steady and new.rejected == memory.rejected):
+        return new, False
+    grown = _grown(builders, estimate, new)
+    return grown, grown == new
+
+
+def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:
+    """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
+    positions = position_builders(builders)
+    wandering = frozenset(b.name for b in positions if b.wanders(memory))
+    if memory.stage < LAST_STAGE:
+        later = any(b.stage == LAST_STAGE for b in builders) or any(b.grows(memory) for b in positions)
+        return replace(memory, stage=LAST_STAGE, correlated=wandering) if later else memory
+    blind = {
+        state.name: state.prior_mean
+        for state in estimate.session.values()
+        if not state.held and (state.sigma > OBSERVED * state.prior_sigma).all()
+    }
+    return replace(memory, held={**memory.held, **blind}, correlated=wandering)
 
 
 def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Memory:
     """Variance component of the rows without a sigma of their own; rows outside the gate do not count."""
     if builder.name in memory.correlated:
         return memory
-    outside = _outside(builder, found, memory) | memory.rejected.get(builder.name, frozenset())
+    outside = _position_verdict(builder, found, memory).outside() | memory.rejected.get(builder.name, frozenset())
     used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
     gain = np.clip(found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0)
     redundancy = float((1.0 - gain).sum())
@@ -105,12 +187,3 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> 
     least = LEAST_SIGMA / float(builder.sigma[found.rows[used]].min())
     scale = max(memory.scale(builder.name) * step, least)
     return replace(memory, noise_scales={**memory.noise_scales, builder.name: scale})
-
-
-def _outside(
-    builder: PositionBuilder, found: FixResiduals, memory: Memory, probability: float | None = None
-) -> frozenset[int]:
-    """Rows beyond the gate, at the robust level of all rows."""
-    square = ((found.residual / builder.scaled_sigma(memory)[found.rows]) ** 2).sum(axis=1)
-    outside = builder.gate(square, float(np.median(square)) / MEDIAN_CHI2_3, found.rows, probability)
-    return frozenset(int(row) for row in found.rows[outside])

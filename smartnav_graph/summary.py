@@ -46,7 +46,8 @@ def peak_memory_mb() -> float:
 def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution: Solution) -> dict[str, float]:
     """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
 
-    The redundancy of a fix is what its posterior leaves of its variance; the inertial factors have the rest.
+    Unknowns are the states less the equations that chains and priors bring with them. The redundancy of a fix is what
+    its posterior leaves of its variance; the inertial factors have the rest.
     """
     rows = {
         sensor: solution.residuals.of(sensor) & solution.residuals.used for sensor in set(solution.residuals.sensor)
@@ -56,10 +57,9 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
         for sensor, mask in rows.items()
     }
     count = sum(int(mask.sum()) for mask in rows.values())
-    keyframes, wandering = len(estimate.indices), len(memory.correlated)
-    # a wandering error adds as many equations as states
-    total = max(count - STATE_DIM * keyframes + 12, 1)
-    result = {"overall": 2.0 * estimate.cost / total if wandering else sum(squares.values()) / total}
+    # the position is free of any prior; each chain and session state has one equation of its own
+    total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
+    result = {"overall": 2.0 * estimate.cost / total}
     left = float(total)
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
@@ -133,7 +133,7 @@ def summarise(
         "iterations": estimate.iterations,
         "converged": estimate.converged,
         "cost": estimate.cost,
-        "states": _states(problem, memory),
+        "states": _states(problem, estimate, memory),
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),
@@ -153,9 +153,18 @@ def summarise(
     return summary | dict(extra)
 
 
-def _states(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
-    """Noise found on the way, beside the states of the session."""
-    found = {}
+def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, dict[str, Any]]:
+    """The states of the session, and the noise found on the way."""
+    found: dict[str, dict[str, Any]] = {}
+    for state in estimate.session.values():
+        sigma = state.prior_sigma if state.held else state.sigma
+        value, spread = ([round(float(x), 6) for x in numbers] for numbers in (state.value, sigma))
+        alone = len(value) == 1
+        found[state.name] = {
+            "value": value[0] if alone else value,
+            "sigma": spread[0] if alone else spread,
+            "held": state.held,
+        }
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             found[f"{builder.name}_wander_sigma_m"] = {

@@ -4,15 +4,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder
 
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """default_sigma : m, of points that carry none."""
+    """default_sigma : m, of points that carry none; lever_arm_sigma : m, prior of the lever arm as a state (zero:
+    taken as known)."""
 
     default_sigma: float = 0.05
+    lever_arm_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.default_sigma > 0:
             raise ConfigError("config [control]", f"default_sigma = {self.default_sigma}", "> 0 m")
+        if self.lever_arm_sigma < 0:
+            raise ConfigError("config [control]", f"lever_arm_sigma = {self.lever_arm_sigma}", ">= 0 m")
+
+
+def build(context: FactorContext) -> PositionBuilder | None:
+    """The builder of a session's surveyed points. Whoever stood on a point read the clock of the device itself."""
+    stream, options = context.session.control, context.config.control
+    if stream is None:
+        return None
+    config = GnssConfig(
+        loss=context.config.gnss.loss,
+        gate_probability=context.config.gnss.gate_probability,
+        estimate_sigma=False,
+        correlated=False,
+        time_offset_sigma=0.0,
+        lever_arm_sigma=options.lever_arm_sigma,
+    )
+    noise = GnssNoise(options.default_sigma, options.default_sigma)
+    return PositionBuilder.of(context.session, "control", stream, noise, config)

@@ -1,6 +1,6 @@
 """Position fixes whose error wanders: a first-order Gauss-Markov state beside the white part.
 
-    r = (nav_t_body + nav_R_body * body_t_antenna + c - fix) / sigma        c_j = phi c_i + q,  phi = exp(-dt / tau)
+    r = (nav_t_antenna + c - fix) / sigma        c_j = phi c_i + q,  phi = exp(-dt / tau)
 
 Fixes of code receivers (phones) share their atmospheric and multipath errors for a minute or so. Taken as white they
 make the covariance many times too small; scaling the sigma cures nothing.
@@ -10,8 +10,6 @@ Source: Gelb (1974), Applied Optimal Estimation, 3.8; Niu et al. (2014), GPS Sol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -20,32 +18,6 @@ from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.graph import State, Step, Tag, Window, key
 
 Floats = NDArray[np.float64]
-
-
-class WanderingFix:
-    """Rows: fix (3,) m, lever arm (3,) m body axes, sigma (3,) m. States: pose, correlated error."""
-
-    letters: tuple[str, ...] = ("X", "C")
-
-    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`; the pose tangent is [rotation, translation] on the body side."""
-        pose, wander = states
-        fix, lever, weight = data[:, :3], data[:, 3:6], 1.0 / data[:, 6:9]
-        R = pose[:, :3, :3]
-        residual = (pose[:, :3, 3] + np.einsum("nij,nj->ni", R, lever) + wander - fix) * weight
-        by_pose = np.concatenate([-R @ _skew(lever), R], axis=2) * weight[:, :, None]
-        by_wander = np.eye(3) * weight[:, :, None]
-        return residual, [by_pose, by_wander]
-
-
-MODEL = WanderingFix()
-
-
-def _skew(v: Floats) -> Floats:
-    zero = np.zeros(len(v))
-    return np.stack([zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero], axis=-1).reshape(
-        -1, 3, 3
-    )
 
 
 def wander_sigma(noise: GnssNoise) -> Floats:

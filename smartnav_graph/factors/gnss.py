@@ -1,8 +1,14 @@
-"""Position fixes: r = nav_t_body + nav_R_body * body_t_antenna - fix, in nav metres (GTSAM's GPSFactorArm)."""
+"""Position fixes: r = (nav_t_body + nav_R_body * body_t_antenna - fix) / sigma, in nav axes.
+
+GTSAM's GPSFactorArm where that is all; as rows of a model where the clock offset of the receiver, the lever arm or an
+error that wanders are states.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -11,9 +17,11 @@ from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import correlated
+from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.correlated import add_wander, wander_sigma
-from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, Partial, here, preintegrated, skew, turned
+from smartnav_graph.frames import STANDARD_GRAVITY
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Tag, Window, key
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Positioned
 
@@ -31,18 +39,62 @@ CAUSAL_TAIL = 9.0
 class GnssConfig:
     """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``huber`` or
     ``none``; gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes
-    that carry none from the kept data; correlated : give the wandering error of code receivers a state."""
+    that carry none from the kept data; correlated : give the wandering error of code receivers a state;
+    time_offset_sigma : s, prior of the receiver's clock offset, a state (zero: none); lever_arm_sigma : m, prior of the
+    lever arm as a state (zero: taken as known)."""
 
     loss: str = "gate"
     gate_probability: float = 0.999
     estimate_sigma: bool = True
     correlated: bool = True
+    time_offset_sigma: float = 0.2
+    lever_arm_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if self.loss not in ("gate", "huber", "none"):
             raise ConfigError("config [gnss]", f"loss = {self.loss!r}", "gate, huber or none")
         if not 0.5 < self.gate_probability < 1:
             raise ConfigError("config [gnss]", f"gate_probability = {self.gate_probability}", "between 0.5 and 1")
+        if min(self.time_offset_sigma, self.lever_arm_sigma) < 0:
+            raise ConfigError("config [gnss]", "time_offset_sigma or lever_arm_sigma < 0", ">= 0")
+
+
+class PositionFix:
+    """Data: fix (3) m, lever arm (3) m body axes, sigma (3) m. `extra`: C adds the wandering error of the fix, L to
+    the lever arm."""
+
+    width = 9
+
+    def __init__(self, extra: tuple[str, ...]) -> None:
+        self.extra = extra
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        states = dict(zip(self.extra, extra, strict=True))
+        lever = data[:, 3:6] + states.get("L", 0.0)
+        weight = 1.0 / data[:, 6:9, None]
+        residual = (p + turned(R, lever) + states.get("C", 0.0) - data[:, :3]) * weight[:, :, 0]
+        by_state = np.zeros((len(p), 3, 9))
+        by_state[:, :, :3] = -R @ skew(lever) * weight
+        by_state[:, :, 3:6] = np.eye(3) * weight
+        by = {"C": np.eye(3) * weight, "L": R * weight}
+        return residual, by_state, [by[letter] for letter in self.extra]
+
+
+@cache
+def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
+    """The one row model of each kind of fix; where : ``keyframe``, or ``instant`` for a later time."""
+    observation = PositionFix(extra)
+    if not timed and where == "keyframe":
+        return AtKeyframe(observation)
+    return AtInstant(observation, timed=timed, short=where == "keyframe")
+
+
+def clock_state(sensor: str, sigma: float, initial: float = 0.0) -> SessionState:
+    """Time offset (s) of a sensor's clock: its rows speak of IMU time t + offset."""
+    return SessionState("T", sensor, f"{sensor}_time_offset_s", np.array([initial]), np.array([sigma]))
 
 
 def fix_sigmas(stream: Positioned, default: GnssNoise) -> Floats:
@@ -80,6 +132,8 @@ class PositionBuilder:
     lever: Floats
     config: GnssConfig = field(default_factory=GnssConfig)
     noise: GnssNoise = field(default_factory=GnssNoise)
+    gravity: float = STANDARD_GRAVITY
+    stage: int = 0
 
     @classmethod
     def of(
@@ -89,7 +143,8 @@ class PositionBuilder:
         given = np.full((len(stream), 3), np.nan) if stream.sigma is None else stream.sigma
         own = np.asarray(np.isfinite(given).all(axis=1))
         lever = np.asarray(session.mount(name).body_t, dtype=np.float64)
-        return cls(name, session.nav_position(stream), fix_sigmas(stream, noise), own, lever, config, noise)
+        position, sigma = session.nav_position(stream), fix_sigmas(stream, noise)
+        return cls(name, position, sigma, own, lever, config, noise, session.gravity)
 
     def wanders(self, memory: Memory) -> bool:
         """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
@@ -123,21 +178,89 @@ class PositionBuilder:
         square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum()
         return "cauchy" if self.gate(np.array([square]), CAUSAL_TAIL, np.array([row]))[0] else "none"
 
+    def grows(self, memory: Memory) -> bool:
+        """Whether there is more to these fixes once the trajectory is found: states of their own."""
+        return bool(self._states(replace(memory, stage=LAST_STAGE))) or self.wanders(memory)
+
+    def _states(self, memory: Memory) -> dict[str, SessionState]:
+        """Session states in use, by letter."""
+        if memory.stage < LAST_STAGE:
+            return {}
+        clock, lever = self.config.time_offset_sigma, self.config.lever_arm_sigma
+        found = {}
+        if clock > 0:
+            found["T"] = clock_state(self.name, clock)
+        if lever > 0:
+            name = f"{self.name}_lever_arm_correction_m"
+            found["L"] = SessionState("L", self.name, name, np.zeros(3), np.full(3, lever))
+        return found
+
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
-        """A factor for every row of this stream at the keyframe."""
+        """A factor for every row of this stream that became known in the window."""
         wanders = self.name in memory.correlated
         if wanders:
             add_wander(step, window, previous, self.noise)
-        rows = window.rows.get(self.name, ())
-        for row in rows:
-            sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
-            if memory.is_rejected(self.name, int(row)):
-                continue
-            loss = self._loss_of(int(row), sigma, step, memory)
-            if wanders and loss == "none":
-                self._add_wandering(step, int(row), sigma)
-            else:
-                self._add_native(step, int(row), noise_model(sigma, loss))
+        states = self._states(memory)
+        for row in window.rows.get(self.name, ()):
+            self._add_row(step, int(row), memory, states, self._at_keyframe(step, window, states))
+        for late in window.late.get(self.name, ()):
+            assert previous is not None
+            partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
+            self._add_row(step, late.row, memory, states, (late.window.index - 1, partial))
+
+    def force(self, window: Window, nav_R_body: Floats, bias: Floats) -> Floats:
+        """Accelerometer reading (3,) at the window's end; of a body not accelerated where the window has no samples."""
+        if len(window.dt):
+            return np.asarray(window.accel[-1])
+        return np.asarray(nav_R_body.T @ np.array([0.0, 0.0, self.gravity]) + bias[:3])
+
+    def _at_keyframe(
+        self, step: Step, window: Window, states: Mapping[str, SessionState]
+    ) -> tuple[int, Partial | None]:
+        if "T" not in states:
+            return step.index, None
+        rate = window.gyro[-1] if len(window.dt) else step.bias.gyroscope()
+        accel = self.force(window, step.predicted.attitude().matrix(), step.bias.vector())
+        return step.index, here(step.bias, accel, rate, self.gravity)
+
+    def _add_row(
+        self,
+        step: Step,
+        row: int,
+        memory: Memory,
+        states: Mapping[str, SessionState],
+        at: tuple[int, Partial | None],
+    ) -> None:
+        """One fix, at a keyframe or after it by a partial preintegration."""
+        index, partial = at
+        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
+        used = not memory.is_rejected(self.name, row)
+        loss = self._loss_of(row, sigma, step, memory) if index == step.index else self._loss_late(memory)
+        chain = self.name in memory.correlated
+        if partial is None and not (states or chain):
+            if used:
+                self._add_native(step, row, noise_model(sigma, loss))
+            return
+        extra = ("C",) * chain + ("L",) * ("L" in states)
+        keys = [key("X", index), key("V", index)]
+        where = "keyframe" if index == step.index else "instant"
+        if where == "instant":
+            keys.append(key("B", index))
+        if "T" in states:
+            keys.append(step.use(states["T"]))
+        if chain:
+            keys.append(key("C", index))
+        if "L" in states:
+            keys.append(step.use(states["L"]))
+        data = np.concatenate([self.position[row], self.lever, sigma])
+        if partial is not None:
+            data = np.concatenate([data, partial.columns()])
+        model = model_of(extra, "T" in states, where)
+        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, (row,), (used,), loss))
+
+    def _loss_late(self, memory: Memory) -> str:
+        """Loss of a late fix in replay: no prediction of its own time is at hand to gate it with."""
+        return "none" if self.config.loss == "none" else "huber"
 
     def _add_native(self, step: Step, row: int, model: gtsam.noiseModel.Base) -> None:
         pose, tag = key("X", step.index), Tag(self.name, step.t_ns, row)
@@ -146,7 +269,10 @@ class PositionBuilder:
         else:
             step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
 
-    def _add_wandering(self, step: Step, row: int, sigma: Floats) -> None:
-        keys = (key("X", step.index), key("C", step.index))
-        data = np.concatenate([self.position[row], self.lever, sigma])[None]
-        step.blocks.append(Block(self.name, correlated.MODEL, [keys], data))
+
+def build(context: FactorContext) -> PositionBuilder | None:
+    """The builder of a session's GNSS fixes."""
+    stream = context.session.gnss
+    if stream is None:
+        return None
+    return PositionBuilder.of(context.session, "gnss", stream, context.calibration.gnss_noise, context.config.gnss)

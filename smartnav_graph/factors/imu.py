@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
 from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import Gap, seconds_since
@@ -96,6 +97,7 @@ class ImuBuilder:
     bridges: dict[int, BridgeNoise] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
+    stage: int = 0
     _spent_s: float = 0.0
 
     def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
@@ -187,3 +189,10 @@ class ImuBuilder:
 
 def _factor(i: int, j: int, pim: Any) -> gtsam.ImuFactor:
     return gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
+
+
+def build(context: FactorContext) -> ImuBuilder:
+    """The builder of a session's inertial data."""
+    imu, noise = context.session.require_imu(), context.calibration.imu_noise
+    bridges = {gap.start_ns: bridge_noise(imu, context.gaps, gap.length_s, noise) for gap in context.gaps}
+    return ImuBuilder(noise, context.session.gravity, context.gaps, bridges, context.config.imu)

@@ -54,6 +54,7 @@ class PriorBuilder:
     rest_end_ns: int | None = None
     attitude: gtsam.Rot3 | None = None
     name: str = "prior"
+    stage: int = 0
 
     def placed(self) -> PriorBuilder:
         """The same with a position sigma of 100 km where there is none, for a smoother that solves at the first

@@ -19,8 +19,10 @@ from smartnav_graph.smoothers.estimate import (
     copy_state,
     eliminated,
     indeterminate,
-    nav_covariances,
+    posterior,
+    session_values,
     state_at,
+    states_of,
 )
 from smartnav_graph.smoothers.minimise import COARSE, Solve, SolveConfig, minimise
 from smartnav_graph.smoothers.whole_graph import WholeGraph
@@ -92,6 +94,10 @@ class Batch:
     def update(self, step: Step) -> None:
         """Take one step; settle the latest stretch when it is long enough."""
         self.steps.append(step)
+        for name, state in step.session.items():
+            if not self.values.exists(name):
+                known = self.warm is not None and self.warm.exists(name)
+                self.values.insert(name, self.warm.atVector(name) if known else state.initial)
         if self.warm is not None:
             copy_state(step, self.warm, self.values)
             return
@@ -195,7 +201,8 @@ class Batch:
                 graph = WholeGraph(self.steps)
                 solve = minimise(graph, solve.values, order, self.solve)
             solved = time.perf_counter()
-            covariance = nav_covariances(eliminated(graph, solve.values, self.steps), self.steps, solve.values)
+            marginals = posterior(eliminated(graph, solve.values, self.steps), self.steps)
+            covariance = marginals.nav(states_of(solve.values, indices)[0])
         except RuntimeError as error:
             raise self._explain(error) from error
         check_covariance(covariance, self.steps, self.t0_ns)
@@ -210,6 +217,8 @@ class Batch:
             iterations=solve.iterations,
             converged=solve.converged,
             cost=solve.cost,
+            session=session_values(self.steps, solve.values, marginals),
+            marginals=marginals,
             seconds={
                 "solve": self._settle_s + solved - begin,
                 "covariance": time.perf_counter() - solved,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -13,9 +13,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, Block, State, Step, Tag, key
+from smartnav_graph.graph import KEYFRAME_LETTERS, Block, SessionState, State, Step, Tag, key, kind_of
+from smartnav_graph.smoothers.whole_graph import Stack, stacks_of
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SessionValue:
+    """A session state found: value (d,), covariance (d, d), mean and sigma (d,) of its prior; held: a constant of this
+    solve."""
+
+    name: str
+    key: int
+    value: Floats
+    covariance: Floats
+    prior_mean: Floats
+    prior_sigma: Floats
+    held: bool
+
+    @property
+    def sigma(self) -> Floats:
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Marginals of a solved graph, on GTSAM's tangents (pose on the body side).
+
+    joint : (n, 15, 15) of each keyframe; following : (n - 1, 15, 15) of each with the next; session : (d, d) by key
+    """
+
+    joint: Floats
+    following: Floats
+    session: Mapping[int, Floats]
+
+    def nav(self, nav_R_body: Floats) -> Floats:
+        """`joint` in nav axes."""
+        return to_nav_axes(self.joint, nav_R_body)
 
 
 @dataclass(frozen=True)
@@ -24,6 +59,8 @@ class Estimate:
 
     values : gtsam.Values at the solution; indices, t_ns : keyframes, in time order
     covariance : (n, 15, 15) rotation, position, velocity (nav axes), accelerometer and gyroscope bias (body axes)
+    marginals : the same on GTSAM's tangents, with more
+    session : session states by name, held ones too
     factors, blocks : every native factor with its tag, and every block; iterations, converged, cost : of the last solve
     seconds : wall time by stage
     """
@@ -37,7 +74,24 @@ class Estimate:
     iterations: int
     converged: bool
     cost: float
+    marginals: Posterior
+    session: Mapping[str, SessionValue] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def offset_s(self, sensor: str) -> float:
+        """Time offset of a sensor, zero where it has none."""
+        found = self.session.get(f"{sensor}_time_offset_s")
+        return 0.0 if found is None else float(found.value[0])
+
+    def session_value(self, name: str, size: int) -> Floats:
+        """Value (size,) of a session state, zeros where there is none."""
+        found = self.session.get(name)
+        return np.zeros(size) if found is None else found.value
+
+    def stacks(self, sensor: str) -> list[Stack]:
+        """The blocks of one sensor, joined; see `Stack.linearize` for their residuals."""
+        held = {state.key: state.value for state in self.session.values() if state.held}
+        return stacks_of((block for block in self.blocks if block.sensor == sensor), held)
 
     @cached_property
     def _states(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -84,12 +138,22 @@ def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
     return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
 
 
+def session_states(steps: Iterable[Step]) -> dict[int, SessionState]:
+    """The free session states that steps touch, by key."""
+    found: dict[int, SessionState] = {}
+    for step in steps:
+        found |= step.session
+    return found
+
+
 def chronological_order(steps: Sequence[Step]) -> gtsam.Ordering:
-    """Keyframes as they come: the cheapest elimination of a chain."""
+    """Keyframes as they come, then what they all share: the cheapest elimination of a chain."""
     order = gtsam.Ordering()
     for step in steps:
         for name in step.names():
             order.push_back(name)
+    for name in session_states(steps):
+        order.push_back(name)
     return order
 
 
@@ -98,12 +162,12 @@ def eliminated(graph: Any, values: Any, steps: Sequence[Step]) -> Any:
     return graph.linearize(values).eliminateSequential(chronological_order(steps), gtsam.EliminateQR)
 
 
-def nav_covariances(net: Any, steps: Sequence[Step], values: Any) -> Floats:
-    """Joint covariance (n, 15, 15) of every keyframe from a chain eliminated in chronological order, in nav axes.
+def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
+    """Marginals by recursion over a Bayes net eliminated in chronological order, session states last.
 
-    Each keyframe is conditioned on the next, R x_k + S x_k+1 = d; backwards in time
-    P_k = R^-1 R^-T + K P_k+1 K^T with K = R^-1 S. One small product a keyframe, and stable where nothing holds the
-    trajectory (a dead reckoning of minutes), where GTSAM's shortcuts of the Bayes tree give up.
+    Each keyframe is conditioned on what comes later, R x_k + S y = d; backwards in time P_k = R^-1 R^-T + K P_y K^T
+    and P_ky = -K P_y with K = R^-1 S. One small product a keyframe, and stable where nothing holds the trajectory (a
+    dead reckoning of minutes), where GTSAM's shortcuts of the Bayes tree give up.
 
     Source: Rauch, Tung, Striebel (1965), in square-root information form (Bierman 1977, ch. X).
 
@@ -113,40 +177,109 @@ def nav_covariances(net: Any, steps: Sequence[Step], values: Any) -> Floats:
         A keyframe is not determined.
     """
     conditionals = {net.at(i).keys()[0]: net.at(i) for i in range(net.size())}
-    joint = np.empty((len(steps), 15, 15))
-    later, later_at = np.zeros((0, 0)), dict[int, slice]()
+    groups = [step.names() for step in steps]
+    last_use = _earliest_users(groups, conditionals)
+    session = list(session_states(steps))
+    live, later = _Joint.empty(), {}
+    if session:
+        live = live.before(_slices(session), conditionals)
+        later = {name: live.of(name) for name in session}
+    joint, following = np.empty((len(steps), 15, 15)), np.empty((max(len(steps) - 1, 0), 15, 15))
     for row in reversed(range(len(steps))):
-        at = _slices(steps[row])
+        new, cross = live.conditioned(_slices(groups[row]), conditionals)
+        joint[row] = new[:15, :15]
+        if row < len(following):
+            at = live.at[groups[row + 1][0]].start
+            following[row] = cross[:15, at : at + 15]
+        keep = [name for name in live.at if last_use.get(name, row) < row]
+        live = live.extended(groups[row], new, cross, keep)
+    return Posterior(joint, following, later)
+
+
+def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, Any]) -> dict[int, int]:
+    """The earliest group that is conditioned on each state."""
+    found: dict[int, int] = {}
+    for row, names in enumerate(groups):
+        for name in names:
+            for parent in conditionals[name].keys()[1:]:
+                found.setdefault(parent, row)
+    return found
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """Joint covariance of the states that earlier ones are still conditioned on."""
+
+    at: dict[int, slice]
+    covariance: Floats
+
+    @classmethod
+    def empty(cls) -> _Joint:
+        return cls({}, np.zeros((0, 0)))
+
+    def of(self, name: int) -> Floats:
+        return self.covariance[self.at[name], self.at[name]]
+
+    def conditioned(self, at: dict[int, slice], conditionals: Mapping[int, Any]) -> tuple[Floats, Floats]:
+        """Covariance of a new group and its cross covariance with the states of this joint."""
         size = max(part.stop for part in at.values())
-        R, S = np.zeros((size, size)), np.zeros((size, len(later)))
+        R, S = np.zeros((size, size)), np.zeros((size, len(self.covariance)))
         for name, part in at.items():
             conditional = conditionals[name]
-            if conditional.R().shape != R[part, part].shape:
-                raise RuntimeError(f"(Symbol: {chr(gtsam.symbolChr(name))}{steps[row].index})")
-            R[part, part] = conditional.R()
+            own = conditional.R()
+            if own.shape != (part.stop - part.start,) * 2:
+                raise RuntimeError(f"(Symbol: {gtsam.Symbol(name).string()})")
+            R[part, part] = own
             rest, column = conditional.S(), 0
             for parent in conditional.keys()[1:]:
-                block = at.get(parent) or later_at[parent]
+                block = at.get(parent) or self.at[parent]
                 width = block.stop - block.start
                 (R if parent in at else S)[part, block] = rest[:, column : column + width]
                 column += width
         if not np.isfinite(R).all() or (np.diag(R) == 0.0).any():
-            raise RuntimeError(f"(Symbol: X{steps[row].index})")
+            raise RuntimeError(f"(Symbol: {gtsam.Symbol(next(iter(at))).string()})")
         inverse = np.linalg.inv(R)
         gain = inverse @ S
-        later, later_at = inverse @ inverse.T + gain @ later @ gain.T, at
-        joint[row] = later[:15, :15]
-    return to_nav_axes(joint, states_of(values, [step.index for step in steps])[0])
+        cross = -gain @ self.covariance
+        return inverse @ inverse.T - cross @ gain.T, cross
+
+    def before(self, at: dict[int, slice], conditionals: Mapping[int, Any]) -> _Joint:
+        """The joint of one more group and nothing else."""
+        return _Joint(at, self.conditioned(at, conditionals)[0])
+
+    def extended(self, names: Sequence[int], own: Floats, cross: Floats, keep: Sequence[int]) -> _Joint:
+        """The joint of a new group and the states `keep` of this one."""
+        at = _slices(names)
+        if not keep:
+            return _Joint(at, own)
+        columns = np.concatenate([np.arange(self.at[name].start, self.at[name].stop) for name in keep])
+        held = cross[:, columns]
+        joint = np.block([[own, held], [held.T, self.covariance[np.ix_(columns, columns)]]])
+        return _Joint(_slices([*names, *keep]), joint)
 
 
-def _slices(step: Step) -> dict[int, slice]:
-    """Where each state of a step stands in its joint vector; pose, velocity and bias come first."""
+def _slices(names: Iterable[int]) -> dict[int, slice]:
+    """Where each state stands in a joint vector."""
     at, start = {}, 0
-    for name in step.names():
-        size = STATES[chr(gtsam.symbolChr(name))].dim
+    for name in names:
+        size = kind_of(name).dim
         at[name] = slice(start, start + size)
         start += size
     return at
+
+
+def session_values(steps: Sequence[Step], values: Any, marginals: Posterior) -> dict[str, SessionValue]:
+    """What was found of every session state, by name."""
+    found = {}
+    for step in steps:
+        for name, state in step.session.items():
+            if state.name not in found:
+                value, cov = values.atVector(name), marginals.session[name]
+                found[state.name] = SessionValue(state.name, name, value, cov, state.initial, state.sigma, False)
+        for name, state in step.constants.items():
+            none, value = np.zeros((len(state.initial),) * 2), step.held[name]
+            found[state.name] = SessionValue(state.name, name, value, none, state.initial, state.sigma, True)
+    return found
 
 
 def to_nav_axes(joint: Floats, nav_R_body: Floats) -> Floats:

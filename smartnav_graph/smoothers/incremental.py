@@ -5,7 +5,8 @@ QR factorisation, because Cholesky gives up on yaw that is only weakly known (Ka
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import State, Step, key
-from smartnav_graph.smoothers.estimate import Estimate, eliminated, indeterminate, nav_covariances, to_nav_axes
-from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
+from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, SessionState, State, Step, key, kind_of
+from smartnav_graph.smoothers.estimate import (
+    Estimate,
+    eliminated,
+    indeterminate,
+    posterior,
+    session_values,
+    states_of,
+    to_nav_axes,
+)
+from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor, session_prior
 
 Floats = NDArray[np.float64]
 
@@ -38,20 +47,11 @@ class ReplayConfig:
             raise ConfigError("config [replay]", f"lag_s = {self.lag_s}", "> 0 s")
 
 
-# Steps that move a linearisation point: only rotation and bias make the factors nonlinear.
-_THRESHOLDS = {
-    "X": np.array([0.005] * 3 + [0.1] * 3),
-    "V": np.full(3, 0.1),
-    "B": np.array([0.01] * 3 + [0.001] * 3),
-    "C": np.full(3, 1.0),
-}
-
-
 def isam2_params(factor: float) -> gtsam.ISAM2Params:
     """iSAM2 with QR and relinearisation at every step that needs it."""
     thresholds = gtsam.ISAM2ThresholdMap()
-    for letter, size in _THRESHOLDS.items():
-        thresholds.insert((letter, factor * size))
+    for letter, kind in STATES.items():
+        thresholds.insert((letter, factor * kind.moved))
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.setRelinearizeThreshold(thresholds)
@@ -70,6 +70,8 @@ class Incremental:
             gtsam.IncrementalFixedLagSmoother(config.lag_s, params) if self._fixed_lag else gtsam.ISAM2(params)
         )
         self.steps: list[Step] = []
+        self.dropped: Counter[str] = Counter()
+        self._session: dict[int, SessionState] = {}
         self._left = gtsam.Values()
         self._inside: deque[Step] = deque()
 
@@ -93,25 +95,47 @@ class Incremental:
         SolverError
             The new state is not determined; names time, state and sensors.
         """
-        graph = gtsam.NonlinearFactorGraph()
+        if not self._fixed_lag:
+            # a state that touches every step makes each of iSAM2's updates as long as the whole session
+            step.hold({state.name: state.initial for state in step.session.values()})
+        self._make_room(step)
+        self._drop_late(step)
+        values, graph = step.values(), gtsam.NonlinearFactorGraph()
         for _, factor in step.factors:
             graph.push_back(factor)
         for block in step.blocks:
-            for row in range(len(block.keys)):
-                graph.push_back(custom_factor(block, row))
-        self._make_room(step)
+            for row in np.flatnonzero(block.used):
+                graph.push_back(custom_factor(block, int(row), step.held))
+        for name, state in step.session.items():
+            if name not in self._session:
+                values.insert(name, state.initial)
+                graph.push_back(session_prior(state))
+        self._session |= step.session
         try:
             if self._fixed_lag:
-                stamps = dict.fromkeys(step.names(), step.t_s)
-                self._engine.update(graph, step.values(), stamps)
+                self._engine.update(graph, values, dict.fromkeys([*step.names(), *self._session], step.t_s))
             else:
-                self._engine.update(graph, step.values())
+                self._engine.update(graph, values)
         except RuntimeError as error:
             t_ns = {s.index: s.t_ns for s in [*self.steps, step]}
             touching = {s.index: s.sensors() for s in [*self.steps, step]}
             raise indeterminate(error, t_ns, self.t0_ns, touching) from error
         self.steps.append(step)
         self._inside.append(step)
+
+    def _drop_late(self, step: Step) -> None:
+        """Leave out, and count, rows that speak of keyframes which have left the lag."""
+        if not (self._fixed_lag and self._inside):
+            return
+        oldest = self._inside[0].index
+        kept = []
+        for block in step.blocks:
+            late = [min(_keyframes(keys), default=oldest) < oldest for keys in block.keys]
+            if any(late):
+                self.dropped[block.sensor] += sum(late)
+                block = replace(block, used=[u and not gone for u, gone in zip(block.used, late, strict=True)])
+            kept.append(block)
+        step.blocks = kept
 
     def _make_room(self, step: Step) -> None:
         """Keep the last estimate of the states that the coming update marginalises."""
@@ -149,6 +173,8 @@ class Incremental:
         values = gtsam.Values(self._left)
         for step in self._inside:
             self._keep(step, values)
+        for name in self._session:
+            values.insert(name, self._engine.calculateEstimateVector(name))
         return values
 
     def estimate(self, count: int | None = None) -> Estimate:
@@ -158,14 +184,22 @@ class Incremental:
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
         graph, values, indices = WholeGraph(steps), self.values(), [step.index for step in steps]
+        marginals = posterior(eliminated(graph, values, steps), steps)
         return Estimate(
             values=values,
             indices=indices,
             t_ns=np.array([step.t_ns for step in steps], dtype=np.int64),
-            covariance=nav_covariances(eliminated(graph, values, steps), steps, values),
+            covariance=marginals.nav(states_of(values, indices)[0]),
             factors=[item for step in steps for item in step.factors],
             blocks=[block for step in steps for block in step.blocks],
             iterations=len(steps),
             converged=True,
             cost=graph.error(values),
+            session=session_values(steps, values, marginals),
+            marginals=marginals,
         )
+
+
+def _keyframes(keys: Sequence[int]) -> list[int]:
+    """Indices of the keyframes among the states of a row."""
+    return [gtsam.symbolIndex(name) for name in keys if kind_of(name).letter in KEYFRAME_LETTERS]

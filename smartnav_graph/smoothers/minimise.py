@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.errors import ConfigError, SolverError
+from smartnav_graph.graph import STATES, kind_of
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,6 @@ FLAT = 3
 # Enough to go on from: a later solve finishes the work.
 COARSE = SolveConfig(max_iterations=40, tolerance=0.03, step_tolerance=1.0)
 FIRST = SolveConfig(max_iterations=40, tolerance=1e-4, step_tolerance=1e-2)
-
-
-# Step sizes that a damping of one holds a state to: rad, m; m/s; m/s^2, rad/s; m.
-_TRUST = {
-    "X": np.array([0.3] * 3 + [100.0] * 3),
-    "V": np.full(3, 10.0),
-    "B": np.array([0.3] * 3 + [0.02] * 3),
-    "C": np.full(3, 10.0),
-}
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,7 @@ def minimise(
     cost = graph.error(values)
     if not np.isfinite(cost):
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
-    trust = np.concatenate([_TRUST[chr(gtsam.symbolChr(name))] for name in list(values.keys())])
+    trust = np.concatenate([kind_of(name).trust for name in list(values.keys())])
     damping, iterations, converged, flat = 0.0, 0, False, 0
     while iterations < config.max_iterations and not converged:
         iterations += 1
@@ -119,12 +111,12 @@ def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
     if damping:
         linear = linear.clone()
         damper = {
-            letter: (np.diag(np.sqrt(damping) / scale), np.zeros(len(scale)), gtsam.noiseModel.Unit.Create(len(scale)))
-            for letter, scale in _TRUST.items()
+            letter: (np.diag(np.sqrt(damping) / kind.trust), np.zeros(kind.dim), gtsam.noiseModel.Unit.Create(kind.dim))
+            for letter, kind in STATES.items()
         }
         for i in range(order.size()):
             name = order.at(i)
-            rows, zero, unit = damper[chr(gtsam.symbolChr(name))]
+            rows, zero, unit = damper[kind_of(name).letter]
             linear.push_back(gtsam.JacobianFactor(name, rows, zero, unit))
     try:
         return linear.optimize(order)

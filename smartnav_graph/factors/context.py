@@ -1,0 +1,23 @@
+"""What a builder may be made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.session import Session
+from smartnav_graph.timebase import Gap
+
+
+@dataclass(frozen=True)
+class FactorContext:
+    """The session without its withheld rows, the device's calibration, holes of the inertial data, what carries the
+    device (none, car, trolley, foot), and the options of all rooms (`config.Config`, which stands below this room)."""
+
+    session: Session
+    calibration: Calibration
+    gaps: Sequence[Gap]
+    vehicle: str
+    config: Any

@@ -1,0 +1,285 @@
+"""Measurements of the state at one instant, and the row models that carry them to keyframes.
+
+An `Observation` knows the state (R, p, v) at its own time and nothing else. `AtKeyframe` takes it at a keyframe;
+`AtInstant` at any time after one, foretold by partial preintegration, with the clock offset of its sensor as a state
+where asked:
+
+    R(t) = R_i dR Exp(w d)
+    p(t) = p_i + v_i dt + g dt^2 / 2 + R_i dp + v d + a d^2 / 2
+    v(t) = v_i + g dt + R_i dv + a d
+
+with d the offset beyond the nominal one, w and a the rate and acceleration then. Third-order terms in d are left out:
+1 mm for 0.1 s in a car that brakes.
+
+Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III-V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.graph import Window
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+
+class Observation(Protocol):
+    """One kind of measurement.
+
+    extra : letters of the states it touches beside pose and velocity; width : columns of data it reads
+    """
+
+    extra: tuple[str, ...]
+    width: int
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """Whitened residual (m, d) and its derivatives.
+
+        Parameters
+        ----------
+        R (m, 3, 3), p (m, 3) m, v (m, 3) m/s : nav_R_body, nav_t_body, nav_v_body at the row's time
+        extra : one array (m, n) a letter of `extra`; data : (m, width)
+
+        Returns
+        -------
+        residual (m, d); by_state (m, d, 9) by rotation (body side: R <- R Exp(w)), nav position, nav velocity;
+        by_extra, one (m, d, n) a letter
+        """
+        ...
+
+
+def skew(v: Floats) -> Floats:
+    """Cross-product matrices (m, 3, 3) of vectors (m, 3)."""
+    zero = np.zeros(len(v))
+    rows = [zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def exp(w: Floats) -> Floats:
+    """Rotation matrices (m, 3, 3) of rotation vectors (m, 3)."""
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+
+
+def turned(R: Floats, v: Floats) -> Floats:
+    """R v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", R, v))
+
+
+class AtKeyframe:
+    """Row model of an observation whose rows stand at keyframes, by a clock that is right."""
+
+    def __init__(self, observation: Observation) -> None:
+        self.observation = observation
+        self.letters: tuple[str, ...] = ("X", "V", *observation.extra)
+
+    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
+        """See `graph.RowModel`."""
+        pose, v, *extra = states
+        R = pose[:, :3, :3]
+        residual, by, by_extra = self.observation.observe(R, pose[:, :3, 3], v, extra, data)
+        by_pose = np.concatenate([by[:, :, :3], by[:, :, 3:6] @ R], axis=2)
+        return residual, [by_pose, by[:, :, 6:9], *by_extra]
+
+
+class Partial(NamedTuple):
+    """Preintegrated from a keyframe to an instant; see `preintegrated`.
+
+    dt s; dR (3, 3), dp (3,), dv (3,) at `bias` (6,); by_bias (9, 6) of [rotation, dp, dv]; accel, gyro (3,) measured
+    there; gravity m/s^2
+    """
+
+    dt: float
+    dR: Floats
+    dp: Floats
+    dv: Floats
+    by_bias: Floats
+    bias: Floats
+    accel: Floats
+    gyro: Floats
+    gravity: float
+
+    def columns(self, offset: float = 0.0) -> Floats:
+        """The data columns that `AtInstant` appends to an observation's own; `offset` s is the nominal time offset
+        already contained in the instant."""
+        return np.concatenate(
+            [
+                [self.dt],
+                self.dR.ravel(),
+                self.dp,
+                self.dv,
+                self.by_bias.ravel(),
+                self.bias,
+                self.accel,
+                self.gyro,
+                [self.gravity, offset],
+            ]
+        )
+
+
+_AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 54, "bias": 6, "accel": 3, "gyro": 3, "gravity": 1, "offset": 1}
+WIDTH = sum(_AT.values())
+# Bias steps (m/s^2, rad/s) of the numerical derivative of a partial preintegration: its second order is negligible.
+_BIAS_STEP = np.array([1e-3] * 3 + [1e-5] * 3)
+
+
+def here(bias: Any, accel: Floats, gyro: Floats, gravity: float) -> Partial:
+    """The partial preintegration of no length: the instant is the keyframe itself."""
+    zero = np.zeros(3)
+    return Partial(0.0, np.eye(3), zero, zero, np.zeros((9, 6)), bias.vector(), accel, gyro, gravity)
+
+
+def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Partial:
+    """From the keyframe before `window` to the instant `t_ns` inside it, at `bias` (gtsam ConstantBias).
+
+    Raises
+    ------
+    ValueError
+        The instant lies outside the window.
+    """
+    if not window.t0_ns <= t_ns <= window.t1_ns:
+        raise ValueError(f"{t_ns} ns lies outside the window {window.t0_ns} to {window.t1_ns} ns")
+    dt = _until(window.dt, (t_ns - window.t0_ns) / NS)
+    base = bias.vector()
+
+    def deltas(vector: Floats) -> Any:
+        at = gtsam.imuBias.ConstantBias(vector[:3], vector[3:])
+        pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(gravity), at)
+        for accel, gyro, step in zip(window.accel, window.gyro, dt.tolist(), strict=False):
+            pim.integrateMeasurement(accel, gyro, step)
+        return pim
+
+    middle = deltas(base)
+    dR = middle.deltaRij().matrix()
+    by_bias = np.zeros((9, 6))
+    for i, step in enumerate(_BIAS_STEP):
+        up, down = (deltas(base + sign * step * np.eye(6)[i]) for sign in (1.0, -1.0))
+        turn = Rotation.from_matrix(down.deltaRij().matrix().T @ up.deltaRij().matrix()).as_rotvec()
+        change = [turn, up.deltaPij() - down.deltaPij(), up.deltaVij() - down.deltaVij()]
+        by_bias[:, i] = np.concatenate(change) / (2.0 * step)
+    last = max(len(dt) - 1, 0)
+    return Partial(
+        float(dt.sum()),
+        dR,
+        middle.deltaPij(),
+        middle.deltaVij(),
+        by_bias,
+        base,
+        window.accel[last],
+        window.gyro[last],
+        gravity,
+    )
+
+
+def _until(dt: Floats, length: float) -> Floats:
+    """The intervals up to `length` s, the last one cut."""
+    ends = np.cumsum(dt)
+    count = int(np.searchsorted(ends, length - 1e-12)) + 1
+    part = dt[:count].copy()
+    if len(part):
+        part[-1] -= max(float(part.sum()) - length, 0.0)
+    return part
+
+
+class AtInstant:
+    """Row model of an observation at any time after a keyframe.
+
+    Data: the observation's columns, then those of `Partial.columns`. `timed` adds the time offset T of its sensor (s):
+    the row speaks of IMU time t + T. `short` is for rows at their keyframe (`here`), where the bias matters only
+    through the offset: it is taken as it was when the row was made, and is no state of the row.
+    """
+
+    def __init__(self, observation: Observation, *, timed: bool = False, short: bool = False) -> None:
+        self.observation = observation
+        self.timed, self.short = timed, short
+        bias, clock = () if short else ("B",), ("T",) if timed else ()
+        self.letters: tuple[str, ...] = ("X", "V", *bias, *clock, *observation.extra)
+
+    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
+        """See `graph.RowModel`."""
+        pose, velocity, *rest = states
+        at = _unpack(data[:, self.observation.width :])
+        bias = at["bias"] if self.short else rest.pop(0)
+        there = _foretold(pose, velocity, bias, at)
+        clock: list[Floats] = []
+        if self.timed:
+            offset = rest.pop(0)
+            there, by_clock = _delayed(there, bias, offset[:, 0] - at["offset"][:, 0], at)
+            clock = [by_clock]
+        own = data[:, : self.observation.width]
+        residual, by, by_extra = self.observation.observe(there.R, there.p, there.v, rest, own)
+        moved = there.by[:2] if self.short else there.by
+        return residual, [*(by @ jacobian for jacobian in (*moved, *clock)), *by_extra]
+
+
+@dataclass(frozen=True)
+class _There:
+    """State at the instant; by : derivatives (m, 9, n) by pose, velocity and bias."""
+
+    R: Floats
+    p: Floats
+    v: Floats
+    by: tuple[Floats, Floats, Floats]
+
+
+def _unpack(columns: Floats) -> dict[str, Floats]:
+    out, start = {}, 0
+    for name, width in _AT.items():
+        out[name] = columns[:, start : start + width]
+        start += width
+    return out
+
+
+def _foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> _There:
+    """By the partial preintegration, corrected to first order for the bias."""
+    m = len(pose)
+    by_bias = at["by_bias"].reshape(m, 9, 6)
+    change = turned(by_bias, bias - at["bias"])
+    turn = exp(change[:, :3])
+    dR = at["dR"].reshape(m, 3, 3) @ turn
+    dp, dv = at["dp"] + change[:, 3:6], at["dv"] + change[:, 6:9]
+    Ri, dt = pose[:, :3, :3], at["dt"]
+    fall = np.array([0.0, 0.0, -1.0]) * at["gravity"]
+    p = pose[:, :3, 3] + velocity * dt + 0.5 * fall * dt**2 + turned(Ri, dp)
+    v = velocity + fall * dt + turned(Ri, dv)
+    by_pose, by_velocity, by_b = np.zeros((m, 9, 6)), np.zeros((m, 9, 3)), np.zeros((m, 9, 6))
+    by_pose[:, :3, :3] = dR.transpose(0, 2, 1)
+    by_pose[:, 3:6, :3] = -Ri @ skew(dp)
+    by_pose[:, 3:6, 3:] = Ri
+    by_pose[:, 6:9, :3] = -Ri @ skew(dv)
+    by_velocity[:, 3:6] = dt[:, :, None] * np.eye(3)
+    by_velocity[:, 6:9] = np.eye(3)
+    by_b[:, :3] = (np.eye(3) - 0.5 * skew(change[:, :3])) @ by_bias[:, :3]
+    by_b[:, 3:6], by_b[:, 6:9] = Ri @ by_bias[:, 3:6], Ri @ by_bias[:, 6:9]
+    return _There(Ri @ dR, p, v, (by_pose, by_velocity, by_b))
+
+
+def _delayed(there: _There, bias: Floats, delta: Floats, at: dict[str, Floats]) -> tuple[_There, Floats]:
+    """The state `delta` (m,) s later, and its derivative (m, 9, 1) by it."""
+    m, d = len(delta), delta[:, None]
+    rate, force = at["gyro"] - bias[:, 3:], at["accel"] - bias[:, :3]
+    a = turned(there.R, force) + np.array([0.0, 0.0, -1.0]) * at["gravity"]
+    turn = exp(rate * d)
+    onward = np.zeros((m, 9, 9))
+    onward[:, :3, :3] = turn.transpose(0, 2, 1)
+    lean = -there.R @ skew(force)
+    onward[:, 3:6, :3] = 0.5 * d[:, :, None] ** 2 * lean
+    onward[:, 6:9, :3] = d[:, :, None] * lean
+    onward[:, 3:6, 3:6] = onward[:, 6:9, 6:9] = np.eye(3)
+    onward[:, 3:6, 6:9] = d[:, :, None] * np.eye(3)
+    by_pose, by_velocity, by_bias = (onward @ jacobian for jacobian in there.by)
+    by_bias[:, :3, 3:] -= d[:, :, None] * (np.eye(3) - 0.5 * skew(rate * d))
+    by_bias[:, 3:6, :3] -= 0.5 * d[:, :, None] ** 2 * there.R
+    by_bias[:, 6:9, :3] -= d[:, :, None] * there.R
+    p, v = there.p + there.v * d + 0.5 * a * d**2, there.v + a * d
+    by_clock = np.concatenate([rate, v, a], axis=1)[:, :, None]
+    return _There(there.R @ turn, p, v, (by_pose, by_velocity, by_bias)), by_clock
