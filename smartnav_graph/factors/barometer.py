@@ -1,0 +1,167 @@
+"""Barometer: relative height with a bias that walks.
+
+    r = (u + v_u d + b - (h(p) - h_0)) / sigma        b_j = b_i + q
+    h(p) = 288.15 / 0.0065 (1 - (p / p_0)^(1 / 5.25588))
+
+u is the height of the body in nav, d how long after the keyframe the mean of its samples stands, h the height of the
+ICAO standard atmosphere. The bias b holds the weather, the undulation of the geoid and the sensor's own offset. Samples
+up to `HALF_S` around a keyframe are taken as one, none twice where keyframes are evenly spaced.
+
+Source: ICAO Doc 7488 (1993), Manual of the ICAO standard atmosphere; below 11 km.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from smartnav_graph.calibration.model import BarometerNoise
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
+from smartnav_graph.streams import Barometer
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+SEA_LEVEL_HPA = 1013.25
+SEA_LEVEL_K, LAPSE_K_M, EXPONENT = 288.15, 0.0065, 5.25588
+HALF_S = 0.5  # samples this long after a keyframe are used: the look-ahead
+UNKNOWN_HEIGHT = 1000.0  # m, of a local frame over the pressure at its start
+
+
+@dataclass(frozen=True)
+class BarometerConfig:
+    """reference_hpa : the day's pressure at sea level, where it is known (else the first samples set the height);
+    reference_sigma : m, of heights from it: the geoid undulates by so much; loss : ``huber`` (doors slam) or ``none``.
+    """
+
+    reference_hpa: float | None = None
+    reference_sigma: float = 50.0
+    loss: str = "huber"
+
+    def __post_init__(self) -> None:
+        if self.loss not in ("huber", "none"):
+            raise ConfigError("config [barometer]", f"loss = {self.loss!r}", "huber or none")
+        if self.reference_hpa is not None and not 850.0 < self.reference_hpa < 1100.0:
+            raise ConfigError("config [barometer]", f"reference_hpa = {self.reference_hpa}", "850 to 1100 hPa")
+        if not self.reference_sigma > 0:
+            raise ConfigError("config [barometer]", f"reference_sigma = {self.reference_sigma}", "> 0 m")
+
+
+def icao_height(pressure_hpa: ArrayLike, reference_hpa: float = SEA_LEVEL_HPA) -> Floats:
+    """Height m of the ICAO standard atmosphere with `reference_hpa` at sea level, of pressures in hPa."""
+    ratio = np.asarray(pressure_hpa, dtype=np.float64) / reference_hpa
+    return np.asarray(SEA_LEVEL_K / LAPSE_K_M * (1.0 - ratio ** (1.0 / EXPONENT)))
+
+
+def metres_a_hpa(pressure_hpa: float) -> float:
+    """By how much the height falls where the pressure rises by 1 hPa: 8.3 m at sea level."""
+    return SEA_LEVEL_K / LAPSE_K_M / EXPONENT / pressure_hpa * (pressure_hpa / SEA_LEVEL_HPA) ** (1.0 / EXPONENT)
+
+
+class Height:
+    """Data: height m over that of the first samples, time s after the keyframe, sigma m. State: D, the bias m."""
+
+    extra: tuple[str, ...] = ("D",)
+    width = 3
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        height, later, weight = data[:, 0], data[:, 1], 1.0 / data[:, 2]
+        residual = (p[:, 2] + v[:, 2] * later + extra[0][:, 0] - height) * weight
+        by_state = np.zeros((len(p), 1, 9))
+        by_state[:, 0, 5] = weight
+        by_state[:, 0, 8] = later * weight
+        return residual[:, None], by_state, [weight[:, None, None]]
+
+
+MODEL = AtKeyframe(Height())
+
+
+@dataclass
+class BarometerBuilder:
+    """Adds the bias of every keyframe, and its height where samples are near.
+
+    t_ns (n,), height (n,) m over nav zero but for the bias, scale m/hPa; bias_sigma m, of the bias at first
+    """
+
+    t_ns: NDArray[np.int64]
+    height: Floats
+    scale: float
+    bias_sigma: float
+    noise: BarometerNoise
+    loss: str
+    name: str = "barometer"
+    stage: int = 0
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """The bias at the keyframe, tied to the one before, and the mean height around the keyframe."""
+        bias = key("D", window.index)
+        measured = self._around(window)
+        foretold = float(step.predicted.position()[2])
+        step.chain[bias] = np.array([0.0 if measured is None else measured[0] - foretold])
+        tag = Tag("barometer_bias", window.t1_ns)
+        if previous is None:
+            model = gtsam.noiseModel.Isotropic.Sigma(1, self.bias_sigma)
+            step.add(tag, gtsam.PriorFactorVector(bias, np.zeros(1), model))
+        else:
+            walk = self.scale * self.noise.pressure_walk * np.sqrt(window.length_s)
+            model = gtsam.noiseModel.Isotropic.Sigma(1, walk)
+            step.add(tag, gtsam.BetweenFactorVector(key("D", window.index - 1), bias, np.zeros(1), model))
+        if measured is not None:
+            keys = (key("X", window.index), key("V", window.index), bias)
+            data = np.array([measured])
+            step.blocks.append(Block(self.name, MODEL, [keys], data, window.t1_ns, loss=self.loss))
+
+    def _around(self, window: Window) -> tuple[float, float, float] | None:
+        """Mean height m, how long after the keyframe it stands s, and its sigma m."""
+        half = int(min(HALF_S, 0.5 * window.length_s or HALF_S) * NS)
+        rows = slice(*np.searchsorted(self.t_ns, (window.t1_ns - half, window.t1_ns + half), side="right"))
+        count = rows.stop - rows.start
+        if count == 0:
+            return None
+        later = float((self.t_ns[rows] - window.t1_ns).mean() / NS)
+        sigma = self.scale * self.noise.pressure_sigma / np.sqrt(count)
+        return float(self.height[rows].mean()), later, float(sigma)
+
+
+def build(context: FactorContext) -> BarometerBuilder | None:
+    """The builder of a session's barometer.
+
+    Raises
+    ------
+    ConfigError
+        A pressure reference for a session that does not know where its nav zero is.
+    """
+    stream, options = context.session.barometer, context.config.barometer
+    if stream is None:
+        return None
+    height, sigma = _heights(stream, context), UNKNOWN_HEIGHT
+    if options.reference_hpa is not None:
+        sigma = options.reference_sigma
+    scale = metres_a_hpa(float(np.median(stream.pressure_hpa)))
+    return BarometerBuilder(stream.t_ns, height, scale, sigma, context.calibration.barometer_noise, options.loss)
+
+
+def _heights(stream: Barometer, context: FactorContext) -> Floats:
+    """Heights (n,) m over nav zero by the pressure reference, or over the first sample without one."""
+    reference, origin = context.config.barometer.reference_hpa, context.session.origin
+    if reference is None:
+        height = icao_height(stream.pressure_hpa)
+        return np.asarray(height - height[0])
+    if origin is None:
+        raise ConfigError(
+            "config [barometer]",
+            f"reference_hpa = {reference} in a session without origin",
+            "a session whose height above the sea is known",
+            "give height_m of the [origin] in session.toml, or leave reference_hpa out",
+        )
+    return np.asarray(icao_height(stream.pressure_hpa, reference) - origin.height_m)
