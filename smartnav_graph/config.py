@@ -16,6 +16,9 @@ from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.prior import PriorConfig
+from smartnav_graph.factors.vehicle import VehicleConfig
+from smartnav_graph.factors.velocity import VelocityConfig
+from smartnav_graph.factors.wheel import WheelConfig
 from smartnav_graph.initialise import InitialiseConfig
 from smartnav_graph.keyframes import KeyframeConfig
 from smartnav_graph.session import VEHICLES
@@ -82,6 +85,9 @@ class Config:
     imu: ImuConfig = field(default_factory=ImuConfig)
     gnss: GnssConfig = field(default_factory=GnssConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
+    velocity: VelocityConfig = field(default_factory=VelocityConfig)
+    wheel: WheelConfig = field(default_factory=WheelConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from smartnav_graph.factors import control, gnss, imu
+from smartnav_graph.factors import control, gnss, imu, vehicle, velocity, wheel
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder
 
@@ -13,6 +13,10 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "imu": imu.build,
     "gnss": gnss.build,
     "control": control.build,
+    "gnss_velocity": velocity.build_gnss,
+    "velocity": velocity.build,
+    "vehicle": vehicle.build,
+    "wheel": wheel.build,
 }
 # Streams that hold the trajectory by themselves. Their rows make keyframes.
 ABSOLUTE = ("gnss", "control")

@@ -1,0 +1,216 @@
+"""A wheeled vehicle goes where it points: no sideways and no vertical velocity of the points that its wheels hold.
+
+    lateral    v_y + w_z x - w_x z + slip  f_y v_x = 0        at the rear axle, on the road
+    vertical   v_z + w_x y - w_y h + squat f_x v_x = 0        between the axles
+
+v, w and f are velocity, angular rate and specific force of the body in the vehicle's own axes (forward, left, up):
+those that the session declares, turned by a mount pitch and yaw. The state M holds what nobody declares: that pitch and
+yaw (rad), the place (x, y, z) of the rear axle on the road and the lever arm h to where road and body pitch meet (m),
+and two compliances (rad per m/s^2): tyres slip sideways in proportion to the force they bear, a body squats when
+pushed.
+
+Source: Dissanayake et al. (2001), IEEE T-RA 17(5), on the constraint; Gillespie (1992), Fundamentals of Vehicle
+Dynamics, ch. 6, on cornering compliance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph import frames
+from smartnav_graph.calibration.model import VEHICLE_CLASSES, VehicleNoise
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.observation import AtKeyframe, skew, turned
+from smartnav_graph.graph import STATES, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.timebase import NS, Gap
+
+Floats = NDArray[np.float64]
+
+MOUNT_SIZE = STATES["M"].dim
+# Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken.
+RATE_S = 0.1
+FORCE_S = 0.3
+
+
+@dataclass(frozen=True)
+class VehicleConfig:
+    """enabled : use the constraint where a vehicle is declared; period_s : at most one row in so many seconds (slip and
+    springs are not white); mount_sigma_deg : prior of mount pitch and yaw beyond the declared axes; lever_sigma m and
+    compliance_sigma rad per m/s^2 : priors of the lever arms and compliances, around zero; loss : of a row, ``none``,
+    ``huber`` or ``cauchy``."""
+
+    enabled: bool = True
+    period_s: float = 1.0
+    mount_sigma_deg: float = 10.0
+    lever_sigma: float = 1.5
+    compliance_sigma: float = 0.01
+    loss: str = "huber"
+
+    def __post_init__(self) -> None:
+        if not min(self.period_s, self.mount_sigma_deg, self.lever_sigma, self.compliance_sigma) > 0:
+            raise ConfigError("config [vehicle]", "a period or sigma <= 0", "> 0")
+        if self.loss not in ("none", "huber", "cauchy"):
+            raise ConfigError("config [vehicle]", f"loss = {self.loss!r}", "none, huber or cauchy")
+
+    @property
+    def prior_sigma(self) -> Floats:
+        """Sigma (8,) of the state M."""
+        turn, arm, soft = np.radians(self.mount_sigma_deg), self.lever_sigma, self.compliance_sigma
+        return np.array([turn, turn, arm, arm, arm, arm, soft, soft])
+
+
+class Turned(NamedTuple):
+    """Vectors (m, 3) in the vehicle's own axes and their derivatives (m, 3, 2) by mount pitch and yaw."""
+
+    rows: Floats
+    by_mount: Floats
+
+
+@dataclass(frozen=True)
+class VehicleAxes:
+    """The vehicle's own axes: vehicle = (Rz(yaw) Ry(pitch))^T declared, for m rows of the state M.
+
+    rotation (m, 3, 3), by (m, 2, 3, 3) its derivatives by pitch and yaw
+    """
+
+    rotation: Floats
+    by: Floats
+
+    @classmethod
+    def of(cls, mount: Floats) -> VehicleAxes:
+        sp, cp, sy, cy = np.sin(mount[:, 0]), np.cos(mount[:, 0]), np.sin(mount[:, 1]), np.cos(mount[:, 1])
+        o = np.zeros(len(mount))
+
+        def matrices(*elements: Floats) -> Floats:
+            return np.stack(elements, axis=-1).reshape(-1, 3, 3)
+
+        rotation = matrices(cp * cy, cp * sy, -sp, -sy, cy, o, sp * cy, sp * sy, cp)
+        by_pitch = matrices(-sp * cy, -sp * sy, -cp, o, o, o, cp * cy, cp * sy, -sp)
+        by_yaw = matrices(-cp * sy, cp * cy, o, -cy, -sy, o, -sp * sy, sp * cy, o)
+        return cls(rotation, np.stack([by_pitch, by_yaw], axis=1))
+
+    def turn(self, declared: Floats) -> Turned:
+        """Vectors (m, 3) given in declared vehicle axes."""
+        return Turned(turned(self.rotation, declared), np.einsum("nkij,nj->nik", self.by, declared))
+
+
+@dataclass(frozen=True)
+class DeclaredVelocity:
+    """nav velocity seen in declared vehicle axes (m, 3), and its derivative (m, 3, 9) by the state."""
+
+    rows: Floats
+    by_state: Floats
+
+    @classmethod
+    def of(cls, R: Floats, v: Floats, body_R_vehicle: Floats) -> DeclaredVelocity:
+        nav_R_vehicle = R @ body_R_vehicle
+        vehicle_R_nav = nav_R_vehicle.transpose(0, 2, 1)
+        by_state = np.zeros((len(v), 3, 9))
+        by_state[:, :, :3] = body_R_vehicle.T @ skew(turned(R.transpose(0, 2, 1), v))
+        by_state[:, :, 6:] = vehicle_R_nav
+        return cls(turned(vehicle_R_nav, v), by_state)
+
+
+class NonHolonomic:
+    """Data: angular rate (3) rad/s and specific force (3) m/s^2 in declared vehicle axes, sigma (2) m/s lateral and
+    vertical. Residual (m, 2)."""
+
+    extra: tuple[str, ...] = ("M",)
+    width = 8
+
+    def __init__(self, body_R_vehicle: Floats) -> None:
+        self.body_R_vehicle = body_R_vehicle
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        (mount,) = extra
+        axes, declared = VehicleAxes.of(mount), DeclaredVelocity.of(R, v, self.body_R_vehicle)
+        x, y, z, h, slip, squat = mount[:, 2:].T
+        vel, rate, force = axes.turn(declared.rows), axes.turn(data[:, :3]), axes.turn(data[:, 3:6])
+        (vx, vy, vz), (wx, wy, wz), (fx, fy, _) = vel.rows.T, rate.rows.T, force.rows.T
+        residual = np.stack([vy + wz * x - wx * z + slip * fy * vx, vz + wx * y - wy * h + squat * fx * vx], axis=1)
+        o, one = np.zeros(len(v)), np.ones(len(v))
+
+        def two_rows(*elements: Floats) -> Floats:
+            return np.stack(elements, axis=-1).reshape(len(v), 2, -1)
+
+        by_velocity = two_rows(slip * fy, one, o, squat * fx, o, one)
+        by_rate = two_rows(-z, o, x, y, -h, o)
+        by_force = two_rows(o, slip * vx, o, squat * vx, o, o)
+        by_axes = by_velocity @ vel.by_mount + by_rate @ rate.by_mount + by_force @ force.by_mount
+        by_rest = two_rows(wz, o, -wx, o, fy * vx, o, o, wx, o, -wy, o, fx * vx)
+        weight = 1.0 / data[:, 6:8, None]
+        by_state = by_velocity @ axes.rotation @ declared.by_state
+        by_mount = np.concatenate([by_axes, by_rest], axis=2)
+        return residual * weight[:, :, 0], by_state * weight, [by_mount * weight]
+
+
+def mount_state(config: VehicleConfig) -> SessionState:
+    """The vehicle state, shared by all that speaks of the vehicle's own axes."""
+    return SessionState("M", "vehicle", "vehicle_mount", np.zeros(MOUNT_SIZE), config.prior_sigma)
+
+
+def recent(window: Window, values: Floats, seconds: float) -> Floats:
+    """Mean (3,) of inertial intervals (m, 3) over the last `seconds` of the window."""
+    before_end = np.cumsum(window.dt[::-1])[::-1]
+    weight = np.where(before_end <= seconds + 1e-9, window.dt, 0.0)
+    weight[-1] = window.dt[-1]
+    return np.asarray(weight @ values / weight.sum())
+
+
+def due(window: Window, period_s: float) -> bool:
+    """Whether a border of the clock's periods lies in the window: at most one row a period, the same in every pass."""
+    period = round(period_s * NS)
+    return window.t1_ns // period != window.t0_ns // period
+
+
+@dataclass
+class VehicleBuilder:
+    """Adds one row of the constraint a period, outside gaps and standstills.
+
+    body_R_vehicle (3, 3) : declared axes; gaps : where rate and force are not known
+    """
+
+    body_R_vehicle: Floats
+    noise: VehicleNoise
+    gaps: Sequence[Gap] = ()
+    config: VehicleConfig = VehicleConfig()
+    name: str = "vehicle"
+    stage: int = 1
+
+    def __post_init__(self) -> None:
+        self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """One row at the end of the window, where one is due."""
+        if not len(window.dt) or not due(window, self.config.period_s) or self._inside_gap(window.t1_ns):
+            return
+        rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
+        force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
+        sigma = [
+            self.noise.lateral_sigma * memory.scale("vehicle_lateral"),
+            self.noise.vertical_sigma * memory.scale("vehicle_vertical"),
+        ]
+        data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
+        keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.config)))
+        step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))
+
+    def _inside_gap(self, t_ns: int) -> bool:
+        return any(gap.start_ns < t_ns < gap.end_ns for gap in self.gaps)
+
+
+def build(context: FactorContext) -> VehicleBuilder | None:
+    """The constraint of a declared vehicle on wheels."""
+    noise, config = VEHICLE_CLASSES.get(context.vehicle), context.config.vehicle
+    if noise is None or not config.enabled:
+        return None
+    device = context.session.device
+    return VehicleBuilder(frames.body_R_vehicle(device.forward, device.up), noise, context.gaps, config)

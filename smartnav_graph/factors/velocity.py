@@ -1,0 +1,190 @@
+"""Measured velocity: of a receiver in nav axes, or of an odometer or flow sensor in body axes.
+
+    gnss       nav_v_body + nav_R_body (w x body_t_antenna) - v_measured = 0
+    velocity   nav_R_body^T nav_v_body + w x body_t_sensor - v_measured = 0
+
+w is the angular rate, bias removed, that the inertial sensor read at that time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here, skew, turned
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.streams import Velocity
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+# A velocity at a keyframe is interpolated between readings no further apart than this, s.
+APART_S = 0.5
+
+
+@dataclass(frozen=True)
+class VelocityConfig:
+    """gnss : use the velocities that come with GNSS fixes; default_sigma : m/s, of body velocities that carry none;
+    loss : of a row, ``none``, ``huber`` or ``cauchy``."""
+
+    gnss: bool = True
+    default_sigma: float = 0.1
+    loss: str = "huber"
+
+    def __post_init__(self) -> None:
+        if not self.default_sigma > 0:
+            raise ConfigError("config [velocity]", f"default_sigma = {self.default_sigma}", "> 0 m/s")
+        if self.loss not in ("none", "huber", "cauchy"):
+            raise ConfigError("config [velocity]", f"loss = {self.loss!r}", "none, huber or cauchy")
+
+
+class NavVelocity:
+    """Data: velocity (3) m/s nav axes, w x lever (3) m/s body axes, sigma (3) m/s. Residual (m, 3)."""
+
+    extra: tuple[str, ...] = ()
+    width = 9
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        arm, weight = data[:, 3:6], 1.0 / data[:, 6:9]
+        by_state = np.zeros((len(v), 3, 9))
+        by_state[:, :, :3] = -R @ skew(arm)
+        by_state[:, :, 6:] = np.eye(3)
+        return (v + turned(R, arm) - data[:, :3]) * weight, by_state * weight[:, :, None], []
+
+
+class BodyVelocity:
+    """Data: velocity (3) m/s body axes, w x lever (3) m/s body axes, sigma (3) m/s. Residual (m, 3)."""
+
+    extra: tuple[str, ...] = ()
+    width = 9
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        weight = 1.0 / data[:, 6:9]
+        body_R_nav = R.transpose(0, 2, 1)
+        body = turned(body_R_nav, v)
+        by_state = np.zeros((len(v), 3, 9))
+        by_state[:, :, :3] = skew(body)
+        by_state[:, :, 6:] = body_R_nav
+        return (body + data[:, 3:6] - data[:, :3]) * weight, by_state * weight[:, :, None], []
+
+
+def clock_state(sensor: str, config: GnssConfig) -> SessionState:
+    """The clock offset that a receiver's fixes and velocities share."""
+    return SessionState("T", sensor, f"{sensor}_time_offset_s", np.zeros(1), np.array([config.time_offset_sigma]))
+
+
+NAV_MODEL = AtKeyframe(NavVelocity())
+NAV_MODEL_TIMED = AtInstant(NavVelocity(), timed=True)
+BODY_MODEL = AtKeyframe(BodyVelocity())
+
+
+def rate_at_end(window: Window, bias: Any) -> Floats:
+    """Angular rate (3,) rad/s, bias removed, at the window's end; zero where it has no samples."""
+    return np.asarray(window.gyro[-1] - bias.gyroscope()) if len(window.dt) else np.zeros(3)
+
+
+@dataclass
+class GnssVelocityBuilder:
+    """Adds the velocities that come with position fixes, at their keyframes and on their clock.
+
+    velocity (n, 3) m/s nav axes, rows that are not known NaN; sigma (n, 3) m/s; lever (3,) m body axes; gravity m/s^2
+    """
+
+    velocity: Floats
+    sigma: Floats
+    lever: Floats
+    gravity: float
+    gnss: GnssConfig
+    config: VelocityConfig
+    name: str = "gnss_velocity"
+    stage: int = 0
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """A row for every known velocity at the keyframe."""
+        rows = [int(row) for row in window.rows.get("gnss", ()) if np.isfinite(self.velocity[row]).all()]
+        if not rows:
+            return
+        states: tuple[int, ...] = (key("X", step.index), key("V", step.index))
+        arm = np.cross(rate_at_end(window, step.bias), self.lever)
+        tail = np.zeros(0)
+        timed = memory.stage >= LAST_STAGE and self.gnss.time_offset_sigma > 0 and len(window.dt) > 0
+        if timed:
+            states = (*states, key("B", step.index), step.use(clock_state("gnss", self.gnss)))
+            tail = here(step.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
+        data = np.array([np.concatenate([self.velocity[row], arm, self.sigma[row], tail]) for row in rows])
+        used = tuple(bool(known) for known in memory.used("gnss", np.array(rows, dtype=np.intp)))
+        model = NAV_MODEL_TIMED if timed else NAV_MODEL
+        block = Block(self.name, model, [states] * len(rows), data, step.t_ns, rows, used, self.config.loss)
+        step.blocks.append(block)
+
+
+@dataclass
+class BodyVelocityBuilder:
+    """Adds one body velocity a keyframe, interpolated between the readings around it."""
+
+    stream: Velocity
+    lever: Floats
+    config: VelocityConfig
+    name: str = "velocity"
+    stage: int = 0
+    lookahead_s: float = APART_S
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """One row at the window's end where readings surround it."""
+        found = self._at(window.t1_ns)
+        if found is None:
+            return
+        velocity, sigma = found
+        arm = np.cross(rate_at_end(window, step.bias), self.lever)
+        data = np.concatenate([velocity, arm, sigma * memory.scale(self.name)])[None]
+        keys = (key("X", step.index), key("V", step.index))
+        step.blocks.append(Block(self.name, BODY_MODEL, [keys], data, step.t_ns, loss=self.config.loss))
+
+    def _at(self, t_ns: int) -> tuple[Floats, Floats] | None:
+        """Velocity (3,) and its sigma (3,); neighbours with a share s and 1 - s in it have (s^2 + (1 - s)^2) of the
+        variance of one."""
+        stamps = self.stream.t_ns
+        after = int(np.searchsorted(stamps, t_ns))
+        before = after if after < len(stamps) and stamps[after] == t_ns else after - 1
+        if before < 0 or after >= len(stamps) or stamps[after] - stamps[before] > APART_S * NS:
+            return None
+        share = 0.0 if after == before else float((t_ns - stamps[before]) / (stamps[after] - stamps[before]))
+        mix = np.array([1.0 - share, share])
+        own = np.full(3, self.config.default_sigma) if self.stream.sigma is None else self.stream.sigma[before]
+        return mix @ self.stream.velocity[[before, after]], own * float(np.sqrt((mix**2).sum()))
+
+
+def build_gnss(context: FactorContext) -> GnssVelocityBuilder | None:
+    """The builder of velocities in a session's GNSS fixes."""
+    fixes, config, noise = context.session.gnss, context.config.velocity, context.calibration.gnss_noise
+    if fixes is None or fixes.velocity is None or not config.gnss:
+        return None
+    h, v = noise.velocity_horizontal_sigma, noise.velocity_vertical_sigma
+    sigma = np.tile(np.array([h, h, v]), (len(fixes), 1))
+    if fixes.sigma_velocity is not None:
+        sigma = np.where(np.isfinite(fixes.sigma_velocity), fixes.sigma_velocity, sigma)
+    lever = np.asarray(context.session.mount("gnss").body_t, dtype=np.float64)
+    gnss, gravity = context.config.gnss, context.session.gravity
+    return GnssVelocityBuilder(np.asarray(fixes.velocity), sigma, lever, gravity, gnss, config)
+
+
+def build(context: FactorContext) -> BodyVelocityBuilder | None:
+    """The builder of a session's body velocities."""
+    stream = context.session.velocity
+    if stream is None:
+        return None
+    lever = np.asarray(context.session.mount("velocity").body_t, dtype=np.float64)
+    return BodyVelocityBuilder(stream, lever, context.config.velocity)
