@@ -1,0 +1,208 @@
+"""Magnetometer: the Earth's field seen from the body, with hard iron and strength of the field as states.
+
+    r = (nav_R_body^T b(F) + A h - y) / sigma        b(F) = (F_h sin d, F_h cos d, F_v)        d declination
+
+y is the mean of the corrected samples of a window, each turned by the gyro to the window's end, and A the same mean of
+what turns the hard iron h (uT, body axes): the samples of a turn tell h and field apart. F holds the horizontal and the
+vertical strength (uT). Where origin and date are known F is that of the World Magnetic Model; where not, all fields on
+Earth are possible, and the magnetometer still says what it can: where north is, up to the iron nearby.
+
+The residual is linear in h and F, so their first values do not matter. What iron nearby adds stays alike for a while:
+a row counts as much as that many independent ones.
+
+Source: Gebre-Egziabher et al. (2006), Calibration of strapdown magnetometers in magnetic field domain, J. Aerosp. Eng.
+19(2), on hard and soft iron; Afzal, Renaudin, Lachapelle (2011), Use of Earth's magnetic field for mitigating gyroscope
+errors, Sensors 11(12), on disturbances seen by intensity and dip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.model import MagnetometerNoise
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.observation import AtKeyframe, exp, skew, turned
+from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.streams import Magnetometer
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+# Horizontal and vertical strength (uT, mean and sigma) of the field anywhere on Earth, for sessions without origin.
+SOMEWHERE = (np.array([25.0, 0.0]), np.array([12.0, 45.0]))
+# Local anomalies of the crust and of buildings beside the model's field, uT.
+MODEL_SIGMA_UT = 2.0
+# Intensities (uT) that a reading without large hard iron can have: the Earth's field, give or take iron nearby.
+EARTHLY_UT = (20.0, 70.0)
+# More samples than this in a window say nothing new.
+MOST_SAMPLES = 25
+# A held hard iron less sure than this (uT) leaves no usable direction.
+SURE_IRON_UT = 5.0
+# Tilt (rad) that a prediction may be off when it is asked for dip.
+TILT = 0.05
+
+
+@dataclass(frozen=True)
+class MagnetometerConfig:
+    """enabled : use the magnetometer; loss : of a row, ``none``, ``huber`` or ``cauchy``; gate_sigmas : where intensity
+    or dip is further off than this, against field and hard iron as far as they are known, the row is not used."""
+
+    enabled: bool = True
+    loss: str = "cauchy"
+    gate_sigmas: float = 4.0
+
+    def __post_init__(self) -> None:
+        if self.loss not in ("none", "huber", "cauchy"):
+            raise ConfigError("config [magnetometer]", f"loss = {self.loss!r}", "none, huber or cauchy")
+        if not self.gate_sigmas > 0:
+            raise ConfigError("config [magnetometer]", f"gate_sigmas = {self.gate_sigmas}", "> 0")
+
+
+class SeenField:
+    """Data: mean corrected reading y (3) uT, A (9) row-major, (sin, cos) of the declination (2), sigma (1) uT."""
+
+    extra: tuple[str, ...] = ("H", "F")
+    width = 15
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        iron, strength = extra
+        y, A, north, weight = data[:, :3], data[:, 3:12].reshape(-1, 3, 3), data[:, 12:14], 1.0 / data[:, 14:15]
+        body_R_nav = R.transpose(0, 2, 1)
+        unit = np.zeros((len(R), 3, 2))
+        unit[:, :2, 0], unit[:, 2, 1] = north, 1.0
+        by_strength = body_R_nav @ unit
+        seen = turned(by_strength, strength)
+        by_state = np.zeros((len(R), 3, 9))
+        by_state[:, :, :3] = skew(seen)
+        w = weight[:, :, None]
+        return (seen + turned(A, iron) - y) * weight, by_state * w, [A * w, by_strength * w]
+
+
+MODEL = AtKeyframe(SeenField())
+
+
+def turned_mean(window: Window, t_ns: NDArray[np.int64], field_ut: Floats, gyro_bias: Floats) -> tuple[Floats, Floats]:
+    """Mean of samples seen from the window's end: reading (3,), and the mean turn (3, 3) from their axes to the end's.
+
+    t_ns (m,) in (t0, t1], field_ut (m, 3), gyro_bias (3,) rad/s. Between samples the turn is the integral of the rate.
+    """
+    border = np.concatenate([[0.0], np.cumsum(window.dt)])
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((window.gyro - gyro_bias) * window.dt[:, None], axis=0)])
+    at = np.append((t_ns - window.t0_ns) / NS, border[-1])
+    reached = np.stack([np.interp(at, border, column) for column in angle.T], axis=-1)
+    steps = exp(reached[1:] - reached[:-1])
+    turns, total = np.empty((len(t_ns), 3, 3)), np.eye(3)
+    for k in range(len(t_ns) - 1, -1, -1):
+        total = total @ steps[k].T
+        turns[k] = total
+    return np.asarray(turned(turns, field_ut).mean(axis=0)), np.asarray(turns.mean(axis=0))
+
+
+@dataclass
+class MagnetometerBuilder:
+    """Adds one row a window: the mean of its samples.
+
+    reading (n, 3) uT as recorded, t_ns (n,); field_ut (2,) horizontal and vertical strength with field_sigma (2,);
+    declination rad; iron_sigma uT
+    """
+
+    t_ns: NDArray[np.int64]
+    reading: Floats
+    field_ut: Floats
+    field_sigma: Floats
+    declination: float
+    iron_sigma: float
+    noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
+    config: MagnetometerConfig = field(default_factory=MagnetometerConfig)
+    name: str = "magnetometer"
+    stage: int = 1
+
+    def __post_init__(self) -> None:
+        self.soft_iron = np.reshape(self.noise.soft_iron, (3, 3))
+        iron = np.asarray(self.noise.hard_iron_ut, dtype=np.float64)
+        self.iron = SessionState("H", self.name, "magnetometer_hard_iron_ut", iron, np.full(3, self.iron_sigma))
+        self.field = SessionState("F", self.name, "magnetometer_field_ut", self.field_ut, self.field_sigma)
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """One row at the end of the window, where it has samples and the gyro tells how they turned."""
+        last = int(np.searchsorted(self.t_ns, window.t1_ns, side="right"))
+        first = int(np.searchsorted(self.t_ns, window.t0_ns, side="right"))
+        if last == first or window.kind in ("first", "gap") or previous is None:
+            return
+        rows = np.arange(first, last)[:: -(-(last - first) // MOST_SAMPLES)]
+        corrected = self.reading[rows] @ self.soft_iron.T
+        y, turn = turned_mean(window, self.t_ns[rows], corrected, previous.bias.gyroscope())
+        A = turn @ self.soft_iron
+        sigma = self.sigma(window.length_s, len(rows))
+        used = self._usable(memory) and not self.disturbed(step.predicted.attitude().matrix(), y, A, sigma)
+        data = np.concatenate([y, A.ravel(), [np.sin(self.declination), np.cos(self.declination), sigma]])
+        keys = (key("X", step.index), key("V", step.index), step.use(self.iron), step.use(self.field))
+        block = Block(
+            self.name, MODEL, [keys], data[None], step.t_ns, rows=(last - 1,), used=(used,), loss=self.config.loss
+        )
+        step.blocks.append(block)
+
+    def sigma(self, length_s: float, count: int) -> float:
+        """Sigma (uT) of a row of `count` samples over `length_s` s.
+
+        The mean of a disturbance that stays alike for tau has over a long time the information of one independent value
+        in 2 tau: rows that stand closer share it.
+        """
+        shared = max(1.0, 2.0 * self.noise.disturbance_s / length_s)
+        return float(np.sqrt(self.noise.sigma_ut**2 / count + self.noise.disturbance_ut**2 * shared))
+
+    def _usable(self, memory: Memory) -> bool:
+        """A hard iron that is held although nobody knows it would pass for north."""
+        return self.iron.name not in memory.held or self.iron_sigma <= SURE_IRON_UT
+
+    def disturbed(self, nav_R_body: Floats, y: Floats, A: Floats, sigma: float) -> bool:
+        """Whether intensity and dip, as horizontal and vertical strength, contradict field and hard iron as they are
+        known beforehand. Whatever the heading: it is the last thing to trust here."""
+        level = nav_R_body @ (y - A @ self.iron.initial)
+        found = np.array([np.hypot(level[0], level[1]), level[2]])
+        known = sigma**2 + self.field_sigma**2 + self.iron_sigma**2 + (TILT * np.linalg.norm(level)) ** 2
+        return bool((np.abs(found - self.field_ut) > self.config.gate_sigmas * np.sqrt(known)).any())
+
+
+def unearthly(reading: Floats) -> float:
+    """By how much (uT) the median intensity of readings (n, 3) lies outside of what the Earth's field has."""
+    size = float(np.median(np.linalg.norm(reading, axis=1)))
+    return max(EARTHLY_UT[0] - size, size - EARTHLY_UT[1], 0.0)
+
+
+def build(context: FactorContext) -> MagnetometerBuilder | None:
+    """Builder of the session's magnetometer.
+
+    Readings whose first second is stronger than any field on Earth hold an uncalibrated hard iron of that size.
+    """
+    stream, config = context.session.magnetometer, context.config.magnetometer
+    if stream is None or not config.enabled:
+        return None
+    noise, nav_field = context.calibration.magnetometer_noise, context.session.magnetic_field_ut
+    strength, sigma = SOMEWHERE
+    if nav_field is not None:
+        strength = np.array([np.hypot(nav_field[0], nav_field[1]), nav_field[2]])
+        sigma = np.full(2, MODEL_SIGMA_UT)
+    return MagnetometerBuilder(
+        stream.t_ns,
+        stream.field_ut,
+        strength,
+        sigma,
+        float(np.radians(context.session.declination_deg)),
+        float(np.hypot(noise.hard_iron_sigma_ut, unearthly(first_second(stream) - np.array(noise.hard_iron_ut)))),
+        noise,
+        config,
+    )
+
+
+def first_second(stream: Magnetometer) -> Floats:
+    """Readings (n, 3) of the first second."""
+    return np.asarray(stream.field_ut[stream.t_ns <= stream.t_ns[0] + NS])
