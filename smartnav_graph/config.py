@@ -14,7 +14,9 @@ import tomli_w
 from smartnav_graph.errors import ConfigError, SmartnavError
 from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.gravity import GravityConfig
 from smartnav_graph.factors.imu import ImuConfig
+from smartnav_graph.factors.magnetometer import MagnetometerConfig
 from smartnav_graph.factors.prior import PriorConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
 from smartnav_graph.factors.velocity import VelocityConfig
@@ -85,6 +87,8 @@ class Config:
     imu: ImuConfig = field(default_factory=ImuConfig)
     gnss: GnssConfig = field(default_factory=GnssConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
+    gravity: GravityConfig = field(default_factory=GravityConfig)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     wheel: WheelConfig = field(default_factory=WheelConfig)

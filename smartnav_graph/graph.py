@@ -52,7 +52,8 @@ STATES: dict[str, StateKind] = {
         _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),
         _kind("M", "vehicle mount", "session", [0.3] * 2 + [1.0] * 4 + [0.1] * 2, [0.01] * 2 + [0.1] * 4 + [1e-3] * 2),
         _kind("W", "wheel scale and delay", "session", [0.1, 0.3], [0.005, 0.01]),
-        _kind("H", "hard iron", "session", [30.0] * 3, [1.0] * 3),
+        _kind("H", "hard iron", "session", [100.0] * 3, [1.0] * 3),
+        _kind("F", "magnetic field strength", "session", [30.0] * 2, [1.0] * 2),
         _kind("K", "step factor", "session", [0.3] * 2, [0.02] * 2),
         _kind("S", "inertial scale and misalignment", "session", [0.03] * 18, [0.003] * 18),
     )

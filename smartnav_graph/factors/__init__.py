@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from smartnav_graph.factors import control, gnss, imu, vehicle, velocity, wheel
+from smartnav_graph.factors import control, gnss, gravity, imu, magnetometer, vehicle, velocity, wheel
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder
 
@@ -17,6 +17,8 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "velocity": velocity.build,
     "vehicle": vehicle.build,
     "wheel": wheel.build,
+    "magnetometer": magnetometer.build,
+    "gravity": gravity.build,
 }
 # Streams that hold the trajectory by themselves. Their rows make keyframes.
 ABSOLUTE = ("gnss", "control")

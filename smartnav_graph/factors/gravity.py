@@ -1,0 +1,167 @@
+"""Gravity holds tilt where nothing else does: over some seconds the mean specific force points up.
+
+    r = [nav_R_body (f - b_a)]_(east, north) / sigma
+
+f is the mean of the specific force over a stretch, turned by the gyro to its end: what is left of it beside gravity is
+the change of velocity over the stretch divided by its length, small for whoever does not travel away. Its sigma grows
+with the motion: a share of the scatter of the force does not average out, and a mean that is longer or shorter than
+gravity tells a lasting acceleration.
+
+The inertial factors use the same force; they say nothing of tilt unless velocity or position is held, and their noise
+is far below this sigma.
+
+Source: Mahony, Hamel, Pflimlin (2008), Nonlinear complementary filters on SO(3), IEEE TAC 53(5), V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.magnetometer import turned_mean
+from smartnav_graph.factors.observation import AtKeyframe, skew, turned
+from smartnav_graph.graph import Block, Memory, State, Step, Window, key
+from smartnav_graph.timebase import NS, ns_from_seconds
+
+Floats = NDArray[np.float64]
+
+# What holds tilt in the end: everything that knows position or velocity.
+HOLDS_TILT = ("gnss", "control", "pose_fixes", "velocity", "wheel")
+WHEELED = ("car", "trolley")
+
+
+@dataclass(frozen=True)
+class GravityConfig:
+    """enabled : ``auto`` (where no position or velocity has come for `alone_s`, on foot or by hand), ``on``, ``off``;
+    stretch_s : over which the force is averaged; least_sigma m/s^2 : of a device at rest; share : of the scatter of the
+    force (m/s^2) that does not average out over a stretch."""
+
+    enabled: str = "auto"
+    alone_s: float = 60.0
+    stretch_s: float = 4.0
+    least_sigma: float = 0.05
+    share: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.enabled not in ("auto", "on", "off"):
+            raise ConfigError("config [gravity]", f"enabled = {self.enabled!r}", "auto, on or off")
+        if not min(self.stretch_s, self.least_sigma, self.share, self.alone_s) > 0:
+            raise ConfigError("config [gravity]", "a length, sigma or share <= 0", "> 0")
+
+
+class Upright:
+    """Data: mean specific force (3) m/s^2 in body axes at the keyframe, sigma (1) m/s^2. Residual (m, 2)."""
+
+    extra: tuple[str, ...] = ("B",)
+    width = 4
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        (bias,) = extra
+        force, weight = data[:, :3] - bias[:, :3], 1.0 / data[:, 3:4]
+        level = R[:, :2] * weight[:, :, None]
+        by_state, by_bias = np.zeros((len(R), 2, 9)), np.zeros((len(R), 2, 6))
+        by_state[:, :, :3] = -level @ skew(force)
+        by_bias[:, :, :3] = -level
+        return turned(R, force)[:, :2] * weight, by_state, [by_bias]
+
+
+MODEL = AtKeyframe(Upright())
+
+
+@dataclass
+class Stretch:
+    """Sums over windows, seen from their end: force times dt (3,) m/s, its size and square times dt, length s."""
+
+    force: Floats = field(default_factory=lambda: np.zeros(3))
+    size: float = 0.0
+    square: float = 0.0
+    length_s: float = 0.0
+    end_ns: int = 0
+
+    def add(self, window: Window, gyro_bias: Floats) -> None:
+        """Append one window."""
+        starts = window.t0_ns + ns_from_seconds(np.concatenate([[0.0], np.cumsum(window.dt)[:-1]]))
+        size = np.linalg.norm(window.accel, axis=1)
+        weighted = window.accel * window.dt[:, None]
+        mean, _ = turned_mean(window, starts, weighted, gyro_bias)
+        _, whole = turned_mean(window, starts[:1], weighted[:1], gyro_bias)
+        self.force = whole @ self.force + mean * len(starts)
+        self.size += float(size @ window.dt)
+        self.square += float(size**2 @ window.dt)
+        self.length_s += window.length_s
+        self.end_ns = window.t1_ns
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the size of the force, m/s^2."""
+        return float(np.sqrt(max(self.square / self.length_s - (self.size / self.length_s) ** 2, 0.0)))
+
+
+@dataclass
+class GravityBuilder:
+    """Adds one row a stretch. held_ns (n,) : stamps of everything that holds tilt; gravity m/s^2."""
+
+    gravity: float
+    held_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    config: GravityConfig = field(default_factory=GravityConfig)
+    name: str = "gravity"
+    stage: int = 0
+    _stretch: Stretch = field(default_factory=Stretch)
+    _begin_ns: int = 0
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """Take the window into the stretch; a row where the stretch is long enough."""
+        if window.kind == "first":
+            self._begin_ns = window.t1_ns
+        if window.kind in ("first", "gap") or window.t0_ns != self._stretch.end_ns:
+            self._stretch = Stretch(end_ns=window.t1_ns)
+            return
+        self._stretch.add(window, step.bias.gyroscope())
+        if self._stretch.length_s < self.config.stretch_s - 1e-6:
+            return
+        done, self._stretch = self._stretch, Stretch(end_ns=window.t1_ns)
+        if not self._alone(window.t1_ns):
+            return
+        mean = done.force / done.length_s
+        data = np.append(mean, self.sigma(mean - step.bias.accelerometer(), done.scatter))[None]
+        keys = [(key("X", step.index), key("V", step.index), key("B", step.index))]
+        step.blocks.append(Block(self.name, MODEL, keys, data, step.t_ns, loss="huber"))
+
+    def _alone(self, t_ns: int) -> bool:
+        if self.config.enabled == "on" or not len(self.held_ns):
+            return True
+        before = int(np.searchsorted(self.held_ns, t_ns, side="right"))
+        since = self._begin_ns if before == 0 else int(self.held_ns[before - 1])
+        return t_ns - since > self.config.alone_s * NS
+
+    def sigma(self, mean: Floats, scatter: float) -> float:
+        """Sigma (m/s^2) of a mean force (3,) less bias whose size scattered by `scatter` m/s^2.
+
+        A force longer than gravity, sqrt(g^2 + a^2), tells an acceleration a; one off by a small e may as well be bias.
+        """
+        size = float(np.linalg.norm(mean))
+        excess = max(abs(size - self.gravity) - BIAS_SLACK, 0.0)
+        lasting = np.sqrt(2.0 * self.gravity * excess)
+        return float(np.sqrt(self.config.least_sigma**2 + (self.config.share * scatter) ** 2 + lasting**2))
+
+
+# Size of the mean force (m/s^2) that an accelerometer bias may be off by without telling an acceleration.
+BIAS_SLACK = 0.2
+
+
+def build(context: FactorContext) -> GravityBuilder | None:
+    """The tilt of whoever has nothing else."""
+    config = context.config.gravity
+    if config.enabled == "off" or (config.enabled == "auto" and context.vehicle in WHEELED):
+        return None
+    stamps = [stream.t_ns for name, stream in context.session.streams().items() if name in HOLDS_TILT]
+    held_ns = np.sort(np.concatenate([np.zeros(0, np.int64), *stamps]))
+    return GravityBuilder(context.session.gravity, held_ns, config)
