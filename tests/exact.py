@@ -14,10 +14,9 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.config import Config
 from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
-from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.graph import STATES, Memory, State, Tag, Window, build_step, key
 from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
 from smartnav_graph.prediction import Kinematics
@@ -25,7 +24,7 @@ from smartnav_graph.session import Device, Mount, Session
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.sensors import Biases
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
-from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.estimate import Estimate, Posterior
 from smartnav_graph.streams import ControlPoint, GnssFix
 from smartnav_graph.timebase import NS, Gap, ns_from_seconds
 
@@ -126,9 +125,8 @@ def assemble(
     aiding = {name: s.t_ns for name in ABSOLUTE if (s := getattr(session, name)) is not None}
     times = keyframe_times(span, list(aiding.values()), gaps, keyframes)
     windows = make_windows(imu, times, gaps, aiding, keyframes)
-    context = FactorContext(
-        session, session.calibration or Calibration(), gaps, ImuConfig(), GnssConfig(loss="none"), ControlConfig()
-    )
+    calibration, config = session.calibration or Calibration(), Config(gnss=GnssConfig(loss="none"))
+    context = FactorContext(session, calibration, gaps, session.device.vehicle, config)
     made = {name: make(context) for name, make in BUILDERS.items()}
     builders = {name: builder for name, builder in made.items() if builder is not None}
     there, biases = truth(times), bias(times)
@@ -159,16 +157,18 @@ def values_of(states: Sequence[State]) -> Any:
 def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
     """An estimate that stands at the graph's own values."""
     n = len(graph.windows)
+    nothing = Posterior(np.zeros((n, 15, 15)), np.zeros((n - 1, 15, 15)), {})
     return Estimate(
         values=graph.values,
         indices=range(n),
         t_ns=np.array([w.t1_ns for w in graph.windows], dtype=np.int64),
         covariance=np.zeros((n, 15, 15)) if covariance is None else covariance,
         factors=[item for step in graph.steps for item in step.factors],
-        blocks=[],
+        blocks=[block for step in graph.steps for block in step.blocks],
         iterations=1,
         converged=True,
         cost=0.0,
+        marginals=nothing,
     )
 
 
