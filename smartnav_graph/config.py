@@ -12,12 +12,14 @@ import cattrs
 import tomli_w
 
 from smartnav_graph.errors import ConfigError, SmartnavError
+from smartnav_graph.factors.barometer import BarometerConfig
 from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.gravity import GravityConfig
 from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.magnetometer import MagnetometerConfig
 from smartnav_graph.factors.prior import PriorConfig
+from smartnav_graph.factors.step import StepConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
 from smartnav_graph.factors.velocity import VelocityConfig
 from smartnav_graph.factors.wheel import WheelConfig
@@ -92,6 +94,8 @@ class Config:
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     velocity: VelocityConfig = field(default_factory=VelocityConfig)
     wheel: WheelConfig = field(default_factory=WheelConfig)
+    barometer: BarometerConfig = field(default_factory=BarometerConfig)
+    steps: StepConfig = field(default_factory=StepConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)

@@ -1,8 +1,8 @@
 """Steps of a walker from the specific force, and how far they carry up to any time.
 
-The magnitude of the specific force, low-passed and freed of its mean, swings once a step. A step spans two upward
-swings; its length in units of the step factor is Weinberg's (max - min)^(1/4). Everything known at t rests on data up
-to t + `LOOKAHEAD_S`.
+The magnitude of the specific force, low-passed and freed of its mean, swings once a step. A step ends where it rises
+again; its length in units of the step factor is Weinberg's (max - min)^(1/4). Everything known at t rests on data up to
+t + `LOOKAHEAD_S`.
 
 Source: Weinberg (2002), Using the ADXL202 in pedometer and personal navigation applications, AN-602.
 """
@@ -10,6 +10,7 @@ Source: Weinberg (2002), Using the ADXL202 in pedometer and personal navigation 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,10 @@ RATE_HZ = 50.0
 CUTOFF_HZ = 3.0  # people make 1.4 to 2.5 steps a second
 HALF_S = 0.2  # half length of the low-pass filter
 MEAN_S = 2.0  # the mean of so many seconds before is taken off
-SWING = 0.4  # m/s^2 above and below the mean that a step exceeds; a hand that stands trembles by less
-SHORTEST_S, LONGEST_S = 0.25, 1.2
-# A step is spread over at most so much of its end, so that it is known in time.
-SPREAD_S = 0.75
-LOOKAHEAD_S = HALF_S + 1.0 / RATE_HZ + SPREAD_S
+RISE = 0.3  # m/s^2 above the mean that ends a step, after as much below it
+LEAST_SWING = 1.5  # m/s^2 from the least to the largest: a slow step swings by 2, a hand that stands by 1
+SHORTEST_S, LONGEST_S = 0.25, 0.75  # what comes before the longest step, or the first after a rest, was no walking
+LOOKAHEAD_S = HALF_S + 1.0 / RATE_HZ + LONGEST_S
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,16 @@ class Steps:
         """(n,) Weinberg's length, metres once multiplied by a step factor of about 0.45."""
         return np.asarray(self.swing**0.25)
 
-    def travelled(self, t_ns: Times) -> Floats:
-        """Length of all steps up to the stamps (m,), each growing evenly over the last `SPREAD_S` of its span."""
-        begin = np.maximum(self.start_ns, self.end_ns - round(SPREAD_S * NS))
+    @cached_property
+    def _knots(self) -> tuple[Times, Floats]:
+        """Where the travelled length bends, and its values there."""
         total = np.cumsum(self.length)
-        knots = np.stack([begin, self.end_ns], axis=1).ravel()
         values = np.stack([total - self.length, total], axis=1).ravel()
+        return np.stack([self.start_ns, self.end_ns], axis=1).ravel(), values
+
+    def travelled(self, t_ns: Times) -> Floats:
+        """Length of all steps up to the stamps (m,), each growing evenly over its span."""
+        knots, values = self._knots
         if not len(knots):
             return np.zeros(len(t_ns))
         zero = int(knots[0])  # nanoseconds since 1970 would lose their last digits as floats
@@ -64,13 +68,12 @@ class Steps:
 def find_steps(imu: Imu) -> Steps:
     """The steps of a recording."""
     force = _swinging(imu)
-    up = _upward(force)
-    stamps = imu.t_ns[0] + ns_from_seconds(np.arange(len(force)) / RATE_HZ)
-    begin, end = up[:-1], up[1:]
-    whole = (end - begin) <= LONGEST_S * RATE_HZ
-    begin, end = begin[whole], end[whole]
+    end = _rises(force)
+    begin = np.maximum(np.concatenate([[0], end[:-1]]), end - round(LONGEST_S * RATE_HZ))
     swing = np.array([np.ptp(force[i : j + 1]) for i, j in zip(begin, end, strict=True)])
-    return Steps(stamps[begin], stamps[end], swing)
+    step = swing >= LEAST_SWING
+    stamps = imu.t_ns[0] + ns_from_seconds(np.arange(len(force)) / RATE_HZ)
+    return Steps(stamps[begin[step]], stamps[end[step]], swing[step])
 
 
 def _swinging(imu: Imu) -> Floats:
@@ -85,15 +88,15 @@ def _swinging(imu: Imu) -> Floats:
     return np.asarray(smooth - (total[span:-1] - total[: -span - 1]) / span)
 
 
-def _upward(force: Floats) -> NDArray[np.intp]:
-    """Samples where the force rises above `SWING`, each after a fall below -`SWING` and at least `SHORTEST_S` after the
+def _rises(force: Floats) -> NDArray[np.intp]:
+    """Samples where the force rises above `RISE`, each after a fall below -`RISE` and at least `SHORTEST_S` after the
     one before."""
     found: list[int] = []
-    low = True
+    low = False
     for k, value in enumerate(force.tolist()):
-        if value < -SWING:
+        if value < -RISE:
             low = True
-        elif value > SWING and low:
+        elif value > RISE and low:
             low = False
             if not found or k - found[-1] >= SHORTEST_S * RATE_HZ:
                 found.append(k)

@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 
 # From the ground up. A room is a module or a folder of modules.
 ORDER = (
-    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health"),
+    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps"),
     *("readers", "simulation", "vision"),
     *("solution", "graph", "factors", "keyframes", "prediction", "smoothers", "first_seconds", "initialise", "config"),
     *("withhold", "problem", "revise", "assemble", "summary", "estimate"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from smartnav_graph.factors import control, gnss, gravity, imu, magnetometer, vehicle, velocity, wheel
+from smartnav_graph.factors import barometer, control, gnss, gravity, imu, magnetometer, step, vehicle, velocity, wheel
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder
 
@@ -19,6 +19,8 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "wheel": wheel.build,
     "magnetometer": magnetometer.build,
     "gravity": gravity.build,
+    "barometer": barometer.build,
+    "steps": step.build,
 }
 # Streams that hold the trajectory by themselves. Their rows make keyframes.
 ABSOLUTE = ("gnss", "control")
