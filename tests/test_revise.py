@@ -133,7 +133,9 @@ def test_a_loss_that_is_no_gate_rejects_nothing(drive):
         problem = prepare(session, Config(gnss=GnssConfig(loss=loss)))
         graph = assemble(session, drive.truth)
         learnt, done = revise(problem.builders, graph.windows, estimate_of(graph), Memory())
-        assert done and learnt.phase == "plain" and not learnt.rejected
+        assert learnt.phase == "plain" and not learnt.rejected
+        assert not done and learnt.stage == 1  # the clock joins
+        assert revise(problem.builders, graph.windows, estimate_of(graph), learnt) == (learnt, True)
 
 
 # --- one step at a time, at the true states ---------------------------------------------------------------------------
@@ -180,7 +182,7 @@ def test_a_step_of_the_scale_is_bounded(drive):
 def test_too_few_fixes_teach_no_sigma(drive):
     session = with_fixes(drive, [30.0] * 3)
     session = session.replace(gnss=session.gnss.take(slice(0, 3)))
-    builders, windows, estimate = at_truth(drive, session, loss="none")
+    builders, windows, estimate = at_truth(drive, session, loss="none", time_offset_sigma=0.0)
     assert revise(builders, windows, estimate, Memory()) == (Memory(), True)
 
 
@@ -192,7 +194,8 @@ def test_phases_follow_each_other(drive):
     two, done = revise(builders, windows, estimate, one)
     assert (two.phase, done, dict(two.rejected)) == ("gated", False, {"gnss": frozenset({40})})
     three, done = revise(builders, windows, estimate, two)
-    assert (three, done) == (two, True)
+    assert (three, done) == (replace(two, stage=1), False)  # what needs the trajectory found joins
+    assert revise(builders, windows, estimate, three) == (three, True)
 
 
 def test_a_row_inside_the_gate_is_let_in_again(drive):
