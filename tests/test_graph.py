@@ -10,8 +10,12 @@ import pytest
 
 from smartnav_graph.graph import (
     KEYFRAME_LETTERS,
+    LAST_STAGE,
+    SENSORS,
     STATES,
+    Block,
     Memory,
+    SessionState,
     State,
     Step,
     Tag,
@@ -39,18 +43,47 @@ def test_a_step_asks_every_builder_in_turn():
     seen = []
 
     class Spy:
-        def __init__(self, name):
-            self.name = name
+        def __init__(self, name, stage=0):
+            self.name, self.stage = name, stage
 
         def add(self, step, window, previous, memory):
             seen.append((self.name, window.index, previous, memory))
             step.add(Tag(self.name, window.t1_ns), None)
 
     memory, previous = Memory(), State(2, 0, None, None)
-    step = build_step(window(), previous, [Spy("imu"), Spy("gnss")], memory, 5 * NS)
+    step = build_step(window(), previous, [Spy("imu"), Spy("vehicle", LAST_STAGE), Spy("gnss")], memory, 5 * NS)
     assert seen == [("imu", 3, previous, memory), ("gnss", 3, previous, memory)]
     assert [tag.sensor for tag, _ in step.factors] == ["imu", "gnss"]
     assert (step.index, step.t_ns, step.t_s) == (3, 7_500_000_000, 2.5)
+
+
+def test_a_builder_of_the_last_stage_waits_for_it():
+    class Late:
+        name, stage = "vehicle", LAST_STAGE
+
+        def add(self, step, window, previous, memory):
+            step.use(CLOCK)
+
+    for memory, there in ((Memory(), False), (Memory(stage=LAST_STAGE), True)):
+        assert bool(build_step(window(), None, [Late()], memory, 0).session) == there
+
+
+CLOCK = SessionState("T", "gnss", "gnss_time_offset_s", np.zeros(1), np.array([0.2]))
+
+
+def test_a_session_state_has_one_key_and_may_be_held():
+    step = Step(4, NS, 1.0)
+    assert step.use(CLOCK) == step.use(CLOCK) == CLOCK.key == key("T", SENSORS.index("gnss"))
+    step.hold({"something_else": np.ones(1)})
+    assert list(step.session) == [CLOCK.key] and not step.held
+    step.hold({"gnss_time_offset_s": np.array([0.06])})
+    assert not step.session and step.constants == {CLOCK.key: CLOCK}
+    np.testing.assert_array_equal(step.held[CLOCK.key], [0.06])
+
+
+def test_a_block_says_of_every_row_where_it_is_from_and_whether_it_counts():
+    block = Block("gnss", None, [(1,), (2,)], np.zeros((2, 3)), NS)
+    assert (block.rows, block.used, block.loss) == ((-1, -1), (True, True), "none")
 
 
 def test_the_values_of_a_step_are_its_own_states():

@@ -7,17 +7,17 @@ import pytest
 from exact import LEVER, assemble, record
 
 from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import BUILDERS, FactorContext
+from smartnav_graph.factors import BUILDERS
+from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.control import ControlConfig
-from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.graph import Memory
 from smartnav_graph.streams import ControlPoint
 
 
 def made(session, **config):
-    context = FactorContext(session, Calibration(), (), ImuConfig(), GnssConfig(), ControlConfig(**config))
+    context = FactorContext(session, Calibration(), (), "none", Config(control=ControlConfig(**config)))
     return BUILDERS["control"](context)
 
 
