@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import SessionError
 from smartnav_graph.factors.gnss import PositionBuilder
+from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import Memory, State
 from smartnav_graph.prediction import Kinematics, states_at
 from smartnav_graph.problem import Problem
@@ -156,9 +157,8 @@ def score(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str
         t_ns = rows.t_ns + round(estimate.offset_s(name) * NS)
         known = np.clip(t_ns, keyframes.t_ns[0], keyframes.t_ns[-1])
         there = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, known)
-        lever = np.asarray(problem.session.mount(name).body_t)
-        lever = lever + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
-        p = there.p + there.v * ((t_ns - known) / NS)[:, None] + there.R @ lever
+        lever = problem.session.lever_arms(rows) + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
+        p = there.p + there.v * ((t_ns - known) / NS)[:, None] + turned(there.R, lever)
         scored[name] = Withheld(rows.t_ns, p - problem.session.nav_position(rows))
     return scored
 

@@ -67,8 +67,8 @@ def fix_residuals(
     measured = [builder.force(windows[k], *at) for k, *at in zip(keyframe, R, bias, strict=True)]
     a = turned(R, np.array(measured).reshape(-1, 3) - bias[:, :3])
     a[:, 2] -= builder.gravity
-    lever = builder.lever + estimate.session_value(f"{builder.name}_lever_arm_correction_m", 3)
-    residual = p + v * delay + 0.5 * a * delay**2 + R @ lever - builder.position[rows]
+    lever = builder.lever[rows] + estimate.session_value(f"{builder.name}_lever_arm_correction_m", 3)
+    residual = p + v * delay + 0.5 * a * delay**2 + turned(R, lever) - builder.position[rows]
     if builder.name in memory.correlated:
         residual += np.array([estimate.values.atVector(key("C", estimate.indices[k])) for k in keyframe]).reshape(-1, 3)
     posterior = np.diagonal(estimate.covariance[keyframe][:, 3:6, 3:6], axis1=1, axis2=2)

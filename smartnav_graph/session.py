@@ -199,6 +199,29 @@ class Session:
         """Where `sensor` sits; at the body origin when the session does not say."""
         return self.sensors.get(sensor, Mount())
 
+    def lever_arms(self, stream: Positioned) -> NDArray[np.float64]:
+        """Lever arm (n, 3) m in body axes of every row: of the sensor that a surveyed point names, else of the stream.
+
+        Raises
+        ------
+        SessionError
+            A row names a sensor of which the session does not know where it sits.
+        """
+        named = getattr(stream, "sensor", None)
+        names = np.full(len(stream), stream.NAME, dtype=object) if named is None else named
+        for row, name in enumerate(names):
+            if named is not None and name and name not in self.sensors:
+                raise SessionError(
+                    stream.NAME,
+                    f"row {row} was taken with {name!r}, which session.toml does not place",
+                    f"[sensors.{name}] with body_t",
+                    "add it, or leave the cell empty for the sensor head itself",
+                    row=row,
+                    stream=stream.NAME,
+                )
+        arms = [self.mount(name or stream.NAME).body_t for name in names]
+        return np.array(arms, dtype=np.float64).reshape(-1, 3)
+
 
 def save(session: Session, path: str | Path, *, force: bool = False) -> None:
     """Write a session folder: session.toml and one Parquet file a stream. Replaces nothing without `force`."""

@@ -121,8 +121,8 @@ def noise_model(sigmas: Floats, loss: str) -> gtsam.noiseModel.Base:
 class PositionBuilder:
     """Adds one position factor a fix.
 
-    position (n, 3) nav m, sigma (n, 3) m, lever (3,) m body axes; `own_sigma` (n,) marks rows whose sigma came with
-    the data and is never scaled.
+    position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
+    came with the data and is never scaled.
     """
 
     name: str
@@ -135,6 +135,9 @@ class PositionBuilder:
     gravity: float = STANDARD_GRAVITY
     stage: int = 0
 
+    def __post_init__(self) -> None:
+        self.lever = np.broadcast_to(self.lever, self.position.shape)
+
     @classmethod
     def of(
         cls, session: Session, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig
@@ -142,7 +145,7 @@ class PositionBuilder:
         """Builder of a session's stream of positions."""
         given = np.full((len(stream), 3), np.nan) if stream.sigma is None else stream.sigma
         own = np.asarray(np.isfinite(given).all(axis=1))
-        lever = np.asarray(session.mount(name).body_t, dtype=np.float64)
+        lever = session.lever_arms(stream)
         position, sigma = session.nav_position(stream), fix_sigmas(stream, noise)
         return cls(name, position, sigma, own, lever, config, noise, session.gravity)
 
@@ -173,7 +176,7 @@ class PositionBuilder:
             return self.config.loss
         if memory.phase != "causal" or step.variance is None:
             return "cauchy" if memory.phase == "robust" else "none"
-        foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever
+        foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever[row]
         wander = wander_sigma(self.noise) ** 2 if self.name in memory.correlated else 0.0
         square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum()
         return "cauchy" if self.gate(np.array([square]), CAUSAL_TAIL, np.array([row]))[0] else "none"
@@ -252,7 +255,7 @@ class PositionBuilder:
             keys.append(key("C", index))
         if "L" in states:
             keys.append(step.use(states["L"]))
-        data = np.concatenate([self.position[row], self.lever, sigma])
+        data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         model = model_of(extra, "T" in states, where)
@@ -264,8 +267,8 @@ class PositionBuilder:
 
     def _add_native(self, step: Step, row: int, model: gtsam.noiseModel.Base) -> None:
         pose, tag = key("X", step.index), Tag(self.name, step.t_ns, row)
-        if self.lever.any():
-            step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever, model))
+        if self.lever[row].any():
+            step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever[row], model))
         else:
             step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
 

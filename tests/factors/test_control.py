@@ -8,11 +8,12 @@ from exact import LEVER, assemble, record
 
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors import BUILDERS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.graph import Memory
+from smartnav_graph.session import Mount
 from smartnav_graph.streams import ControlPoint
 
 
@@ -35,8 +36,22 @@ def test_a_points_own_sigma_and_lever_arm_are_used():
     session = record().session.replace(control=points(sigma=np.full((2, 3), 0.01)))
     control = made(session)
     np.testing.assert_array_equal(control.sigma, 0.01)
-    np.testing.assert_array_equal(control.lever, LEVER)
+    np.testing.assert_array_equal(control.lever, [LEVER, LEVER])
     assert control.own_sigma.all() and control.name == "control"
+
+
+def test_each_point_has_the_lever_arm_of_the_sensor_that_stood_on_it():
+    prism = (0.0, 0.1, 1.4)
+    session = record().session.replace(
+        control=points(sensor=["prism", ""]), sensors={"prism": Mount(body_t=prism), "control": Mount(body_t=LEVER)}
+    )
+    np.testing.assert_array_equal(made(session).lever, [prism, LEVER])
+
+
+def test_a_sensor_that_is_not_placed_is_named():
+    session = record().session.replace(control=points(sensor=["", "prism"]))
+    with pytest.raises(SessionError, match=r"^control: row 1 was taken with 'prism', .*; expected \[sensors.prism\]"):
+        made(session)
 
 
 def test_the_sigma_of_surveyed_points_is_never_estimated():
