@@ -10,7 +10,17 @@ from pathlib import Path
 
 from smartnav_graph import session
 from smartnav_graph.errors import SessionError
-from smartnav_graph.readers import comma2k19, csv_folder, euroc, foot_dual_zupt, gtsam_euroc, gtsam_kitti, pyshoe
+from smartnav_graph.readers import (
+    comma2k19,
+    csv_folder,
+    euroc,
+    foot_dual_zupt,
+    gtsam_euroc,
+    gtsam_kitti,
+    indoor_waypoints,
+    pyshoe,
+    tyrex,
+)
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import Session
@@ -24,6 +34,8 @@ READERS: dict[str, Reader] = {
         comma2k19.READER,
         foot_dual_zupt.READER,
         pyshoe.READER,
+        tyrex.READER,
+        indoor_waypoints.READER,
         csv_folder.READER,
     )
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,19 +24,21 @@ Floats = NDArray[np.float64]
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a file.
+    """The bytes of a file; those inside where its name ends in .gz.
 
     Raises
     ------
     SessionError
-        Missing or unreadable.
+        Missing, unreadable or damaged.
     """
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
+        return gzip.decompress(data) if path.suffix == ".gz" else data
     except FileNotFoundError as error:
         raise SessionError(path, "is missing", "a text file", "check the path") from error
-    except OSError as error:
-        raise SessionError(path, f"cannot be read ({error.strerror})", "a readable file", "check the path") from error
+    except (OSError, EOFError, zlib.error) as error:  # the last two: a damaged gzip file
+        reason = getattr(error, "strerror", None) or error
+        raise SessionError(path, f"cannot be read ({reason})", "a readable file", "check the path") from error
 
 
 def first_lines(path: Path, count: int = 2) -> list[str]:
