@@ -100,6 +100,18 @@ class Stream:
                 row=row,
                 stream=self.NAME,
             )
+        early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
+        if len(early):
+            row = int(early[0])
+            lead = int(self.t_ns[row] - np.asarray(self.arrival_ns)[row])
+            raise SessionError(
+                self.NAME,
+                f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)",
+                "a row becomes known at or after the time it speaks of",
+                "correct the column, or leave it out",
+                row=row,
+                stream=self.NAME,
+            )
         for name in self.__dataclass_fields__:
             if "sigma" in name and getattr(self, name) is not None:
                 sigma = np.asarray(getattr(self, name))

@@ -52,6 +52,16 @@ def test_arrays_are_read_only_and_a_copy(name):
         kept.t_ns = mine
 
 
+def test_a_row_known_before_its_own_time():
+    fix = example(GnssFix)
+    early = np.array(fix.t_ns)
+    early[[3, 5]] -= 7
+    with pytest.raises(SessionError, match=r"^gnss: arrival_ns lies 7 ns before t_ns at row 3 \(2 such rows") as error:
+        dataclasses.replace(fix, arrival_ns=early)
+    assert (error.value.row, error.value.stream) == (3, "gnss")
+    dataclasses.replace(fix, arrival_ns=fix.t_ns)
+
+
 def test_taking_rows_takes_them_everywhere():
     fix = dataclasses.replace(example(GnssFix), extra={"satellites": np.arange(6)})
     for rows in (np.array([0, 2, 5]), np.array([True, False, True, False, False, True])):

@@ -1,0 +1,57 @@
+"""Rows that become known after the time they speak of, in replay.
+
+A row with `arrival_ns` after its own stamp makes no keyframe: nobody knew of it then. It is handed to the window in
+which it arrives, together with the window it speaks of. Batch knows everything and has no late rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.graph import LateRow, Window
+from smartnav_graph.streams import Stream
+
+Times = NDArray[np.int64]
+
+
+def known_ns(stream: Stream) -> Times:
+    """When each row (n,) became known."""
+    return stream.t_ns if stream.arrival_ns is None else stream.arrival_ns
+
+
+def is_late(stream: Stream, merge_ns: int) -> NDArray[np.bool_]:
+    """Mask (n,) of the rows that became known more than `merge_ns` after their time."""
+    return known_ns(stream) - stream.t_ns > merge_ns
+
+
+def arrange(
+    windows: Sequence[Window], streams: Mapping[str, Stream], merge_ns: int
+) -> tuple[list[Window], dict[str, int]]:
+    """The windows with every late row moved to the one in which it arrives; how many never arrive, by stream."""
+    masks = {name: mask for name, stream in streams.items() if (mask := is_late(stream, merge_ns)).any()}
+    if not masks:
+        return list(windows), {}
+    ends = np.array([window.t1_ns for window in windows], dtype=np.int64)
+    late: list[dict[str, list[LateRow]]] = [{} for _ in windows]
+    lost: dict[str, int] = {}
+    for name, mask in masks.items():
+        rows, stamps, known = np.flatnonzero(mask), streams[name].t_ns, known_ns(streams[name])
+        rows = rows[np.argsort(known[rows], kind="stable")]
+        arrives = np.searchsorted(ends, known[rows])
+        speaks = np.searchsorted(ends, stamps[rows], side="right")
+        if (count := int((arrives == len(ends)).sum())) > 0:
+            lost[name] = count
+        for row, k, j in zip(rows.tolist(), arrives.tolist(), speaks.tolist(), strict=True):
+            if k < len(ends):
+                late[k].setdefault(name, []).append(LateRow(row, int(stamps[row]), windows[j]))
+    return [_arranged(window, late[k], masks) for k, window in enumerate(windows)], lost
+
+
+def _arranged(window: Window, late: Mapping[str, Sequence[LateRow]], masks: Mapping[str, NDArray[np.bool_]]) -> Window:
+    """One window without the rows that are not known at its end, with those that arrive in it."""
+    rows = {name: found[~masks[name][found]] if name in masks else found for name, found in window.rows.items()}
+    return replace(window, rows={name: found for name, found in rows.items() if len(found)}, late=late)
