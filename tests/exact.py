@@ -6,8 +6,9 @@ windows are interpolated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import gtsam
@@ -25,6 +26,7 @@ from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.sensors import Biases
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
 from smartnav_graph.smoothers.estimate import Estimate, Posterior
+from smartnav_graph.smoothers.whole_graph import custom_factor
 from smartnav_graph.streams import ControlPoint, GnssFix
 from smartnav_graph.timebase import NS, Gap, ns_from_seconds
 
@@ -107,6 +109,16 @@ class Graph:
         """Tagged factors of these sensors."""
         return [item for step in self.steps for item in step.factors if item[0].sensor in sensors]
 
+    def rows(self, *sensors: str) -> list[tuple[Tag, Any]]:
+        """Tagged rows of the blocks of these sensors, each as a factor of its own without loss."""
+        return [
+            (Tag(block.sensor, block.t_ns, row), custom_factor(replace(block, loss="none"), i, step.held))
+            for step in self.steps
+            for block in step.blocks
+            if block.sensor in sensors
+            for i, row in enumerate(block.rows)
+        ]
+
 
 def assemble(
     session: Session,
@@ -117,8 +129,10 @@ def assemble(
     memory: Memory | None = None,
     keyframes: KeyframeConfig | None = None,
     span: tuple[int, int] | None = None,
+    known: Mapping[str, Any] = MappingProxyType({}),
 ) -> Graph:
-    """The graph of `session` with every step built at the states that `truth` and `bias` tell."""
+    """The graph of `session` with every step built at the states that `truth` and `bias` tell; `known` are the true
+    values of session states by name, the others stand at their initial ones."""
     keyframes = keyframes or KeyframeConfig()
     imu = session.require_imu()
     span = span or (int(imu.t_ns[0]), int(imu.t_ns[-1]))
@@ -135,7 +149,13 @@ def assemble(
         build_step(w, states[k - 1] if k else None, builders.values(), memory or Memory(), int(times[0]))
         for k, w in enumerate(windows)
     ]
-    return Graph(windows, builders, steps, values_of(states))
+    values = values_of(states)
+    for step in steps:
+        own = {s.key: known.get(s.name, s.initial) for s in step.session.values()} | step.chain
+        for name, value in own.items():
+            if not values.exists(name):
+                values.insert(name, np.asarray(value, dtype=np.float64))
+    return Graph(windows, builders, steps, values)
 
 
 def state(truth: Truth, row: int, t_ns: int, bias: np.ndarray) -> State:

@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 MOUNT_SIZE = STATES["M"].dim
 # Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken.
-RATE_S = 0.1
+RATE_S = 0.05
 FORCE_S = 0.3
 
 

@@ -35,7 +35,7 @@ from smartnav_graph.timebase import NS
 Floats = NDArray[np.float64]
 
 # Readings this far (s) before and after a keyframe make its straight line: 1 cm/s of curvature when a car brakes hard.
-HALF_LINE_S = 0.25
+HALF_LINE_S = 0.2
 LEAST_ROWS = 3
 # m/s backwards from which a speed without sign is taken as negative.
 REVERSING = 0.5

@@ -1,0 +1,254 @@
+"""What every builder of blocks owes: zero at the truth, honest derivatives and sigmas, causality, no broken numbers.
+
+Everything runs over CASES, in units of sigma; a new sensor adds its row, or `test_contract` fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from exact import LEVER, START_NS, Graph, Recording, assemble, assert_derivative, record
+from scipy.stats import chi2
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.graph import LAST_STAGE, Memory, kind_of
+from smartnav_graph.session import Device, Session
+from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
+from smartnav_graph.streams import Velocity, WheelSpeed
+from smartnav_graph.timebase import NS, ns_from_seconds
+
+Wrong = Callable[[Session], Session]
+Record = Callable[[int | None], Recording]
+SHIFT_NS = NS // 10
+MEMORY = Memory(stage=LAST_STAGE)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One builder.
+
+    record : its recording, exact for None, noisy for a seed; honest : largest |component| at the truth, in sigma
+    mutations : name -> (mistake, rms over the rows it must exceed, in sigma); known : true session states
+    stream : stream and field whose broken numbers are refused; noisy : whether its sigma is that of simulated noise
+    lookahead_s : what it may see of the time after a keyframe
+    """
+
+    record: Record
+    honest: float
+    mutations: Mapping[str, tuple[Wrong, float]]
+    known: Mapping[str, Any] = field(default_factory=dict)
+    stream: tuple[str, str] | None = None
+    noisy: bool = True
+    lookahead_s: float = 0.0
+
+
+# --- recordings -------------------------------------------------------------------------------------------------------
+
+YAW, AHEAD, ABOVE, RIGHT = np.radians(3.0), 1.2, 0.5, 0.3  # rad, m: how the phone sits in the car
+SIGMA = 0.2  # m/s
+
+
+def _ride() -> Trajectory:
+    """A car on a plain: 20 s of turns, gain and loss of speed; the phone turned and ahead of the rear axle."""
+    legs = [Leg(4.0, 10.0), Leg(6.0, 10.0, 80.0), Leg(4.0, 4.0), Leg(6.0, 9.0, -60.0)]
+    return Trajectory(Legs(legs, speed=6.0), held_deg=(float(np.degrees(YAW)), 0.0, 0.0), carried=(RIGHT, AHEAD, ABOVE))
+
+
+@cache
+def car(seed: int | None) -> Recording:
+    """A ride with wheel speeds at 20 Hz, body velocities at 10 Hz and velocities in the fixes."""
+    made = record(_ride(), seed=seed)
+    session, ride = made.session, made.trajectory
+    rng = np.random.default_rng((0 if seed is None else seed, 1))
+    noise = 0.0 if seed is None else SIGMA
+    t = np.arange(0.0, ride.duration, 0.05)
+    fixes = ride.sample((session.gnss.t_ns - START_NS) / NS)
+    arm = np.cross(fixes.body_rate, LEVER)
+    of_fixes = fixes.nav_v_body + np.einsum("nij,nj->ni", fixes.nav_R_body, arm)
+    there = ride.sample(t[::2] + 0.003)
+    in_body = np.einsum("nji,nj->ni", there.nav_R_body, there.nav_v_body)
+
+    def off(rows: np.ndarray) -> np.ndarray:
+        return rows + noise * rng.standard_normal(rows.shape)
+
+    session = session.replace(
+        device=Device(name="exact", vehicle="car"),
+        wheel=WheelSpeed(t_ns=START_NS + ns_from_seconds(t), speed=off(ride.speed(t)), sigma=np.full(len(t), SIGMA)),
+        velocity=Velocity(
+            t_ns=START_NS + ns_from_seconds(there.t), velocity=off(in_body), sigma=np.full(in_body.shape, SIGMA)
+        ),
+        gnss=replace(session.gnss, velocity=off(of_fixes), sigma_velocity=np.full(of_fixes.shape, SIGMA)),
+    )
+    return replace(made, session=session)
+
+
+# pitch, yaw, the rear axle seen from the phone in the vehicle's own axes (forward, left, up), no compliance
+CAR_STATES = {"vehicle_mount": [0.0, -YAW, -AHEAD, RIGHT, -ABOVE, 0.0, 0.0, 0.0]}
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+def _column(stream: str, name: str, change: Callable[[np.ndarray], np.ndarray]) -> Wrong:
+    def wrong(session: Session) -> Session:
+        rows = getattr(session, stream)
+        return session.replace(**{stream: replace(rows, **{name: change(getattr(rows, name))})})
+
+    return wrong
+
+
+def _axes(forward: str, up: str) -> Wrong:
+    return lambda session: session.replace(device=replace(session.device, forward=forward, up=up))
+
+
+def _late(stream: str) -> Wrong:
+    return _column(stream, "t_ns", lambda t_ns: t_ns + SHIFT_NS)
+
+
+CASES: dict[str, Case] = {
+    "vehicle": Case(
+        car,
+        0.2,  # the rate is the mean of the last 0.05 s, the lever arm 1.2 m
+        {
+            # 8 m/s sideways or up for a sigma of 0.15 m/s
+            "forward axis": (_axes("+x", "+z"), 30.0),
+            "up axis": (_axes("+y", "-x"), 0.5),
+            "rate sign": (_column("imu", "gyro", np.negative), 1.0),
+        },
+        known=CAR_STATES,
+        noisy=False,
+    ),
+    "wheel": Case(
+        car,
+        0.3,  # the straight line through 0.4 s of a car that changes its force by 4 m/s^2 a second
+        {
+            "km/h": (_column("wheel", "speed", lambda v: 3.6 * v), 50.0),
+            "sign": (_column("wheel", "speed", np.negative), 50.0),
+            "forward axis": (_axes("-x", "+z"), 20.0),
+            "clock late by 0.1 s": (_late("wheel"), 1.0),
+        },
+        known=CAR_STATES,
+        stream=("wheel", "speed"),
+        lookahead_s=0.2,
+    ),
+    "velocity": Case(
+        car,
+        0.05,  # a straight line between readings 0.1 s apart
+        {
+            "sign": (_column("velocity", "velocity", np.negative), 50.0),
+            "axes swapped": (_column("velocity", "velocity", lambda v: v[:, [1, 0, 2]]), 20.0),
+            "clock late by 0.1 s": (_late("velocity"), 0.3),
+        },
+        stream=("velocity", "velocity"),
+        lookahead_s=0.5,
+    ),
+    "gnss_velocity": Case(
+        car,
+        0.05,  # the angular rate that turns the lever arm is the mean of the last inertial interval
+        {
+            "sign": (_column("gnss", "velocity", np.negative), 40.0),
+            "nav axes swapped": (_column("gnss", "velocity", lambda v: v[:, [1, 0, 2]]), 20.0),
+            "lever arm forgotten": (lambda session: session.replace(sensors={}), 0.3),
+        },
+    ),
+}
+REFUSING = [sensor for sensor, case in CASES.items() if case.stream]
+NOISY = [sensor for sensor, case in CASES.items() if case.noisy]
+MISTAKES = [(sensor, name) for sensor, case in CASES.items() for name in case.mutations]
+
+
+# --- what is owed -----------------------------------------------------------------------------------------------------
+
+
+@cache
+def graph_of(sensor: str, seed: int | None = None) -> Graph:
+    case = CASES[sensor]
+    made = case.record(seed)
+    return assemble(made.session, made.truth, bias=made.bias, memory=MEMORY, known=case.known)
+
+
+def white(graph: Graph, sensor: str) -> np.ndarray:
+    """Whitened residuals, one row a measurement."""
+    return np.array([factor.whitenedError(graph.values) for _, factor in graph.rows(sensor)])
+
+
+def rms(rows: np.ndarray) -> float:
+    return float(np.sqrt((rows**2).mean()))
+
+
+@pytest.mark.parametrize("sensor", CASES)
+def test_the_residual_at_the_simulated_truth_is_zero(sensor):
+    rows = white(graph_of(sensor), sensor)
+    assert len(rows) >= 15
+    assert np.abs(rows).max() <= CASES[sensor].honest
+
+
+@pytest.mark.parametrize(("sensor", "name"), MISTAKES)
+def test_a_mistake_shows_in_the_residual(sensor, name):
+    case = CASES[sensor]
+    wrong, floor = case.mutations[name]
+    made = case.record(None)
+    found = rms(white(assemble(wrong(made.session), made.truth, memory=MEMORY, known=case.known), sensor))
+    assert found > floor > 2 * case.honest, found
+
+
+def disturbed(graph: Graph, factor: Any) -> gtsam.Values:
+    """Every state of one factor off by 0.02 of its unit: derivatives must hold away from the truth too."""
+    rng = np.random.default_rng(3)
+    delta = gtsam.VectorValues()
+    for name in factor.keys():  # noqa: SIM118
+        delta.insert(name, 0.02 * rng.standard_normal(kind_of(name).dim))
+    return graph.values.retract(delta)
+
+
+@pytest.mark.parametrize("sensor", CASES)
+def test_the_analytic_derivative_is_the_numerical_one(sensor):
+    graph = graph_of(sensor)
+    rows = graph.rows(sensor)
+    _, factor = rows[len(rows) // 2]
+    assert_derivative(factor, disturbed(graph, factor))
+
+
+@pytest.mark.parametrize("sensor", NOISY)
+def test_whitened_residuals_of_simulated_noise_have_unit_variance(sensor):
+    rows = np.concatenate([white(graph_of(sensor, seed), sensor).ravel() for seed in range(4)])
+    low, high = chi2(rows.size).ppf([1e-4, 1 - 1e-4])  # two-sided, 1e-4 in each tail
+    assert low < (rows**2).sum() < high, (low / rows.size, (rows**2).mean(), high / rows.size)
+
+
+@pytest.mark.parametrize("sensor", CASES)
+def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor):
+    case = CASES[sensor]
+    made = case.record(None)
+    cut = int(made.session.imu.t_ns[1300])
+    shorter = made.session.replace(
+        **{name: stream.take(stream.t_ns <= cut) for name, stream in made.session.streams().items()}
+    )
+    full = graph_of(sensor)
+    part = assemble(shorter, made.truth, memory=MEMORY, known=case.known)
+    last = max(w.t1_ns for w in part.windows if w.rows)  # later windows end where the recording does
+    known = min(last, cut - ns_from_seconds(case.lookahead_s))
+    pairs = [[(tag, f) for tag, f in graph.rows(sensor) if tag.t_ns <= known] for graph in (full, part)]
+    assert len(pairs[0]) == len(pairs[1]) > 8
+    for (tag, factor), (other_tag, other) in zip(*pairs, strict=True):
+        assert tag == other_tag
+        values = disturbed(full, factor)
+        np.testing.assert_array_equal(factor.whitenedError(values), other.whitenedError(values))
+
+
+@pytest.mark.parametrize("sensor", REFUSING)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_measurement_that_is_no_number_is_refused_by_name(sensor, value):
+    name, column = CASES[sensor].stream
+    stream = getattr(CASES[sensor].record(None).session, name)
+    rows = np.array(getattr(stream, column))
+    rows.reshape(len(rows), -1)[4, -1] = value
+    with pytest.raises(SessionError, match=rf"^{name}: \w+ is {value} at row 4 .*; expected finite numbers") as error:
+        replace(stream, **{column: rows})
+    assert error.value.stream == name and error.value.row == 4
