@@ -148,7 +148,7 @@ class Batch:
     def _stretch_graph(self, stretch: Sequence[Step], since: float) -> WholeGraph:
         """Factors of a stretch, held at its beginning."""
         first = stretch[0] is self.steps[0]
-        graph = WholeGraph(stretch if first else stretch[1:])
+        graph = WholeGraph.of(stretch if first else stretch[1:])
         if not first:
             graph.native.push_back(self._anchor)
         elif since < HOLD_S:
@@ -195,10 +195,10 @@ class Batch:
         shoot = self._shoot if self.unsure else None
         begin = time.perf_counter()
         try:
-            graph = WholeGraph(self.steps)
+            graph = WholeGraph.of(self.steps)
             solve = minimise(graph, self.values, order, self.solve, shoot)
             if not self.unsure and self._refresh(solve.values):
-                graph = WholeGraph(self.steps)
+                graph = WholeGraph.of(self.steps)
                 solve = minimise(graph, solve.values, order, self.solve)
             solved = time.perf_counter()
             marginals = posterior(eliminated(graph, solve.values, self.steps), self.steps)

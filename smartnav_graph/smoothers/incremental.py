@@ -183,7 +183,7 @@ class Incremental:
         steps = self.steps[:count]
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
-        graph, values, indices = WholeGraph(steps), self.values(), [step.index for step in steps]
+        graph, values, indices = WholeGraph.of(steps), self.values(), [step.index for step in steps]
         marginals = posterior(eliminated(graph, values, steps), steps)
         return Estimate(
             values=values,

@@ -27,6 +27,21 @@ def value_of(values: Any, letter: str, name: int) -> Floats:
     return np.asarray(values.atVector(name))
 
 
+class Snapshot:
+    """States of gtsam.Values as arrays, each fetched once; held states stand at their constants."""
+
+    def __init__(self, values: Any, held: Held) -> None:
+        self._values = values
+        self._found: dict[int, Floats] = dict(held)
+
+    def column(self, letter: str, names: Sequence[int]) -> Floats:
+        """States (m, ...) of one kind."""
+        for name in names:
+            if name not in self._found:
+                self._found[name] = value_of(self._values, letter, name)
+        return np.array([self._found[name] for name in names])
+
+
 def loss_weights(square: Floats, loss: str) -> tuple[Floats, Floats]:
     """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1)."""
     if loss == "none":
@@ -48,16 +63,14 @@ class Stack:
         self.used = np.array([used for block in blocks for used in block.used], dtype=bool)
         self.data = np.concatenate([block.data for block in blocks])
 
-    def _states(self, values: Any) -> list[Floats]:
-        columns = zip(*self.keys, strict=True)
-        return [
-            np.array([self.held[k] if k in self.held else value_of(values, letter, k) for k in column])
-            for letter, column in zip(self.model.letters, columns, strict=True)
-        ]
-
     def linearize(self, values: Any) -> tuple[Floats, list[Floats]]:
-        """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss."""
-        return self.model.linearize(self._states(values), self.data)
+        """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss.
+
+        values : gtsam.Values, or a `Snapshot` that stacks share
+        """
+        snapshot = values if isinstance(values, Snapshot) else Snapshot(values, self.held)
+        columns = zip(self.model.letters, zip(*self.keys, strict=True), strict=True)
+        return self.model.linearize([snapshot.column(letter, names) for letter, names in columns], self.data)
 
     def cost(self, values: Any) -> float:
         """Half the sum of squares of the used rows, under the loss."""
@@ -65,31 +78,25 @@ class Stack:
         return float(loss_weights((residual**2).sum(axis=1), self.loss)[1].sum())
 
     def add_to(self, linear: Any, values: Any) -> None:
-        """Append one JacobianFactor a used row; held states and states that nothing depends on have no column."""
+        """Append one linear factor a used row; held states and states that nothing depends on have no column."""
         residual, jacobians = self.linearize(values)
         root = np.sqrt(loss_weights((residual**2).sum(axis=1), self.loss)[0])
-        residual = residual * root[:, None]
-        columns = [(i, jacobian * root[:, None, None]) for i, jacobian in enumerate(jacobians) if jacobian.any()]
-        unit = gtsam.noiseModel.Unit.Create(residual.shape[1])
+        free = [i for i, jacobian in enumerate(jacobians) if self.keys[0][i] not in self.held and jacobian.any()]
+        augmented = np.concatenate([*(jacobians[i] for i in free), -residual[:, :, None]], axis=2)
+        augmented *= root[:, None, None]
+        dims = [*(jacobians[i].shape[2] for i in free), 1]
         for row in np.flatnonzero(self.used):
             keys = self.keys[row]
-            terms = [(keys[i], jacobian[row]) for i, jacobian in columns if keys[i] not in self.held]
-            linear.push_back(jacobian_factor(terms, -residual[row], unit, values))
+            linear.push_back(linear_factor([keys[i] for i in free], dims, augmented[row]))
 
 
-def jacobian_factor(terms: Sequence[tuple[int, Floats]], b: Floats, unit: Any, values: Any) -> Any:
-    """sum A_i x_i = b as a gtsam.JacobianFactor. Its own constructor takes three terms at most; any number come out of
-    a CustomFactor that is linearised (`values` must hold the keys, and are not looked at)."""
-    if len(terms) <= 3:
-        return gtsam.JacobianFactor(*(part for term in terms for part in term), b, unit)
+def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -> Any:
+    """sum A_i x_i = b from [A_1 ... A_n b] (d, sum of dims): a JacobianFactor of any number of terms.
 
-    def known(this: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
-        if jacobians is not None:
-            for i, (_, A) in enumerate(terms):
-                jacobians[i] = np.asfortranarray(A)
-        return -b
-
-    return gtsam.CustomFactor(unit, [name for name, _ in terms], known).linearize(values)
+    JacobianFactor's own constructor takes three terms at most. A GaussianConditional is a JacobianFactor, and GTSAM
+    treats it as one where it is part of a graph: what it calls frontal does not matter there.
+    """
+    return gtsam.GaussianConditional(keys, 1, gtsam.VerticalBlockMatrix(dims, augmented))
 
 
 def stacks_of(blocks: Iterable[Block], held: Held) -> list[Stack]:
@@ -102,33 +109,38 @@ def stacks_of(blocks: Iterable[Block], held: Held) -> list[Stack]:
 
 
 class WholeGraph:
-    """What `minimise` needs of a graph: `linearize` and `error`. Priors of its session states are part of it."""
+    """What `minimise` needs of a graph: `linearize` and `error`."""
 
-    def __init__(self, steps: Iterable[Step]) -> None:
+    def __init__(self, factors: Iterable[Any], blocks: Iterable[Block], held: Held) -> None:
         self.native = gtsam.NonlinearFactorGraph()
-        blocks: list[Block] = []
-        held: dict[int, Floats] = {}
-        self.session: dict[int, SessionState] = {}
-        for step in steps:
-            for _, factor in step.factors:
-                self.native.push_back(factor)
-            blocks += step.blocks
-            held |= step.held
-            self.session |= step.session
-        for state in self.session.values():
-            self.native.push_back(session_prior(state))
+        for factor in factors:
+            self.native.push_back(factor)
+        self.held = held
         self.stacks = stacks_of(blocks, held)
+
+    @classmethod
+    def of(cls, steps: Sequence[Step]) -> WholeGraph:
+        """Everything that steps add, with the priors of the session states they touch."""
+        session: dict[int, SessionState] = {}
+        held: dict[int, Floats] = {}
+        for step in steps:
+            session |= step.session
+            held |= step.held
+        priors = [session_prior(state) for state in session.values()]
+        factors = [factor for step in steps for _, factor in step.factors]
+        return cls(factors + priors, [block for step in steps for block in step.blocks], held)
 
     def linearize(self, values: Any) -> Any:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""
-        linear = self.native.linearize(values)
+        linear, snapshot = self.native.linearize(values), Snapshot(values, self.held)
         for stack in self.stacks:
-            stack.add_to(linear, values)
+            stack.add_to(linear, snapshot)
         return linear
 
     def error(self, values: Any) -> float:
         """Half the sum of weighted squares."""
-        return float(self.native.error(values)) + sum(stack.cost(values) for stack in self.stacks)
+        snapshot = Snapshot(values, self.held)
+        return float(self.native.error(values)) + sum(stack.cost(snapshot) for stack in self.stacks)
 
 
 def session_prior(state: SessionState) -> Any:

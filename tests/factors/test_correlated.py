@@ -26,7 +26,7 @@ def graph():
     made = assemble(recording.session, recording.truth, memory=WANDERING)
     rng = np.random.default_rng(0)
     for window in made.windows:
-        made.values.insert(key("C", window.index), rng.uniform(-5, 5, 3))
+        made.values.update(key("C", window.index), rng.uniform(-5, 5, 3))
     return made
 
 
@@ -65,7 +65,7 @@ def test_the_analytic_derivative_is_the_numerical_one(graph):
 
 
 def test_blocks_and_custom_factors_are_the_same_system(graph):
-    whole = WholeGraph(graph.steps)
+    whole = WholeGraph.of(graph.steps)
     one_by_one = gtsam.NonlinearFactorGraph()
     for step in graph.steps:
         for _, factor in step.factors:
