@@ -23,7 +23,9 @@ from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.factors.imu import ImuBuilder
+from smartnav_graph.factors.magnetometer import MagnetometerBuilder
 from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.problem import Problem, prepare
@@ -183,8 +185,6 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
-        magnetometer=session.magnetometer,
-        declination_deg=0.0 if session.magnetometer is None else session.declination_deg,
         config=config,
         weak=problem.config.prior,
     )
@@ -192,6 +192,30 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
 
 
 def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats]:
+def _north(problem: Problem) -> dict[str, Any]:
+    """What the magnetometer says of the start, for the initialiser."""
+    builder = next((b for b in problem.builders if isinstance(b, MagnetometerBuilder)), None)
+    stream = problem.session.magnetometer
+    if builder is None or stream is None:
+        return {"magnetometer": None, "declination_deg": 0.0}
+    start = field_start(
+        problem.session.require_imu(),
+        stream,
+        problem.windows[0].t1_ns,
+        problem.calibration.imu_noise,
+        builder.noise,
+        builder.iron_sigma,
+        builder.declination,
+    )
+    return {
+        "magnetometer": stream,
+        "declination_deg": problem.session.declination_deg,
+        "iron_sigma": builder.iron_sigma,
+        "magnetic_stage": builder.stage,
+        "field_start": start,
+    }
+
+
     """Stamps and nav positions of all absolute measurements, in time order."""
     streams = [stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None]
     if not streams:
@@ -310,7 +334,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
                 problem,
                 problem.windows,
                 initial.prior,
-                replace(memory, phase="plain"),
+                initial.memory,
                 warm=before.values,
                 progress=progress,
             )

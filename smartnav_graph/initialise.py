@@ -21,6 +21,7 @@ from smartnav_graph import frames
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
+from smartnav_graph.first_field import FieldStart
 from smartnav_graph.first_seconds import Rest, find_rest, inertial_curve, kabsch_attitude
 from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.smoothers.estimate import Estimate
@@ -37,6 +38,8 @@ REJECTION_COST = 10.0
 LEVELLED = 0.1
 # Heading (rad) that iron nearby may turn a magnetometer by.
 MAGNETIC_SIGMA = 0.35
+# A heading (rad) less sure than this is open.
+OPEN_SIGMA = 1.0
 KABSCH_S = (12.0, np.inf)
 
 
@@ -181,17 +184,23 @@ class Initialiser:
         last = int(np.searchsorted(self.imu.t_ns, self.windows[0].t1_ns + 2 * NS))
         return np.asarray(self.imu.accel[first : max(last, first + 1)].mean(axis=0))
 
-    def _magnetic_heading(self, up: Floats, length_s: float) -> float | None:
-        """Heading deg of the forward axis from the mean field over the rest; None without a magnetometer."""
-        if self.magnetometer is None:
+    def _magnetic_heading(self, rest: Rest | None) -> tuple[float, float] | None:
+        """Heading of the forward axis and its sigma, deg: by field and gravity of the first seconds, else by the mean
+        field over the rest. None without a magnetometer, or where what it reads may be its own iron."""
+        if self.field_start is not None:
+            heading = frames.heading_pitch_roll_deg(self.field_start.nav_R_body, self.forward)[0, 0]
+            return float(heading), float(np.degrees(self.field_start.heading_sigma))
+        if self.magnetometer is None or rest is None:
             return None
         start = self.windows[0].t1_ns
-        chosen = (self.magnetometer.t_ns >= start) & (self.magnetometer.t_ns <= start + int(length_s * NS))
+        chosen = (self.magnetometer.t_ns >= start) & (self.magnetometer.t_ns <= start + int(rest.length_s * NS))
         if not chosen.any():
             return None
-        field_ = self.magnetometer.field_ut[chosen].mean(axis=0)
-        level = frames.nav_R_body_from_heading(0.0, up, self.forward) @ field_
-        return float(np.degrees(-np.arctan2(level[0], level[1])) + self.declination_deg) % 360.0
+        mean = self.magnetometer.field_ut[chosen].mean(axis=0)
+        level = frames.nav_R_body_from_heading(0.0, rest.accel, self.forward) @ mean
+        sigma = float(np.hypot(MAGNETIC_SIGMA, self.iron_sigma / np.hypot(level[0], level[1])))
+        heading = np.degrees(-np.arctan2(level[0], level[1])) + self.declination_deg
+        return (float(heading) % 360.0, float(np.degrees(sigma))) if sigma < OPEN_SIGMA else None
 
     def _prior(self, state: State, rest: Rest | None, **sigmas: Any) -> PriorBuilder:
         noise = self.noise
@@ -199,7 +208,6 @@ class Initialiser:
         mean = gtsam.imuBias.ConstantBias()
         velocity = np.full(3, self.weak.speed_sigma)
         if rest is not None:
-            bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
             velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
@@ -212,15 +220,16 @@ class Initialiser:
             bias_mean=mean,
             rest_end_ns=None if rest is None else self.windows[0].t1_ns + int(rest.length_s * NS),
         )
-        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
+        magnetic = self._magnetic_heading(rest)
         if rest is not None and magnetic is not None:
-            attitude = frames.nav_R_body_from_heading(magnetic, rest.accel, self.forward)
-            soft = np.array([self.weak.angle_sigma, self.weak.angle_sigma, MAGNETIC_SIGMA])
-            prior = replace(prior, attitude=gtsam.Rot3(attitude), sigma_rot=soft)
+            attitude = frames.nav_R_body_from_heading(magnetic[0], rest.accel, self.forward)
+            soft = np.array([self.weak.angle_sigma, self.weak.angle_sigma, np.radians(magnetic[1])])
+            prior = replace(prior, attitude=gtsam.Rot3(attitude), sigma_rot=soft, magnetic_stage=self.magnetic_stage)
         return replace(prior, **sigmas)
 
-    def _state(self, R: Floats, p: Floats, v: Floats, rest: Rest | None) -> State:
-        bias = gtsam.imuBias.ConstantBias() if rest is None else gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+    def _state(self, R: Floats, p: Floats, v: Floats, rest: Rest | None, gyro_bias: Floats | None = None) -> State:
+        gyro = rest.gyro if rest is not None else np.zeros(3) if gyro_bias is None else gyro_bias
+        bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro)
         return State(0, self.windows[0].t1_ns, gtsam.NavState(gtsam.Pose3(gtsam.Rot3(R), p), v), bias)
 
     def _levelled(
@@ -240,16 +249,22 @@ class Initialiser:
 
     def _from_given(self, given: Given, rest: Rest | None) -> Initial:
         prior = self._levelled(given.heading_deg, np.array(given.position), given.sigma_m, given.sigma_deg, rest)
-        how = "levelled over a rest" if rest is not None else "levelled by the first two seconds"
+        how, stretch = "levelled over a rest" if rest is not None else "levelled by the first two seconds", 0.0
+        magnetic = self.field_start
+        if magnetic is not None and np.radians(given.sigma_deg) > OPEN_SIGMA:  # the mean stays what was given
+            pose = prior.start.nav.pose()
+            state = self._state(magnetic.nav_R_body, pose.translation(), np.zeros(3), rest, magnetic.gyro_bias)
+            prior = replace(prior, attitude=pose.rotation(), start=state)
+            how, stretch = f"{how}; turned to magnetic north", magnetic.length_s
         sentence = (
             f"Start given: heading {given.heading_deg:.1f} deg +- {given.sigma_deg:g} deg, position +- "
             f"{given.sigma_m:g} m; {how}."
         )
-        return Initial(prior, "given", sentence, given.heading_deg, given.sigma_deg, 0.0, 1, Memory())
+        return Initial(prior, "given", sentence, given.heading_deg, given.sigma_deg, stretch, 1, Memory())
 
     def _dead_reckoning(self, rest: Rest) -> Initial:
-        magnetic = self._magnetic_heading(rest.accel, rest.length_s)
-        heading, sigma = (magnetic, 10.0) if magnetic is not None else (0.0, 1e-3)
+        magnetic = self._magnetic_heading(rest)
+        heading, sigma = magnetic if magnetic is not None else (0.0, 1e-3)
         prior = self._levelled(heading, np.zeros(3), 1e-3, sigma, rest)
         told = (
             f"heading {heading:.1f} deg from the magnetometer"
@@ -257,10 +272,12 @@ class Initialiser:
             else "heading and position set to zero (local frame)"
         )
         sentence = f"No absolute sensor: started from a rest of {rest.length_s:.1f} s; {told}."
-        return Initial(prior, "static", sentence, heading, sigma, rest.length_s, 1, Memory())
+        stretch = max(rest.length_s, self.field_start.length_s if self.field_start is not None else 0.0)
+        return Initial(prior, "static", sentence, heading, sigma, stretch, 1, Memory())
 
     def _search(self, solve: Solve, rest: Rest | None) -> Initial:
         """Solve the first stretch from the likeliest start; a longer one while the heading stays open; from starts
+        prior = replace(prior, magnetic_stage=None if magnetic is None else self.magnetic_stage)
         all round where the fit is bad or the stretch cannot grow."""
         stretch, tried = self.config.stretch_s, 0
         while True:
@@ -306,7 +323,7 @@ class Initialiser:
     def _starts(self, count: int, rest: Rest | None) -> list[State]:
         """First states to try: the inertial curve laid on the fixes, then headings all round."""
         windows = self.windows[:count]
-        magnetic = None if rest is None else self._magnetic_heading(rest.accel, rest.length_s)
+        magnetic = self._magnetic_heading(rest)
         t_ns, fixes = self.fixes
         used = t_ns <= windows[-1].t1_ns
         t_ns, fixes = t_ns[used], fixes[used]
@@ -326,8 +343,10 @@ class Initialiser:
             if near.sum() >= 4 and not (starts and near.all()):
                 R, p, v = kabsch_attitude(curve[near], fixes[near], t[near], self.gravity)
                 starts.append(self._state(R, p, v, rest))
-        if magnetic is not None:
-            starts.insert(0, self._state(frames.nav_R_body_from_heading(magnetic, up, self.forward), p0, v0, rest))
+        if self.field_start is not None:
+            starts.insert(0, self._state(self.field_start.nav_R_body, p0, v0, rest, self.field_start.gyro_bias))
+        elif magnetic is not None:
+            starts.insert(0, self._state(frames.nav_R_body_from_heading(magnetic[0], up, self.forward), p0, v0, rest))
         course = np.degrees(np.arctan2(v0[0], v0[1])) if np.linalg.norm(v0[:2]) > 1.0 else 0.0
         for heading in course + np.arange(self.config.starts) * 360.0 / self.config.starts:
             R = frames.nav_R_body_from_heading(float(heading), up, self.forward)
@@ -347,7 +366,7 @@ class Initialiser:
         sigma = float(np.degrees(np.sqrt(estimate.covariance[0, 2, 2])))
         stretch = (self.windows[count - 1].t1_ns - self.windows[0].t1_ns) / NS
         method = "static" if rest is not None else "dynamic"
-        magnetic = rest is not None and self.magnetometer is not None
+        magnetic = self._magnetic_heading(rest) is not None
         source = "the magnetometer and the fixes" if magnetic else "the fixes and the inertial data"
         vertical = (
             f"vertical and gyro bias from a rest of {rest.length_s:.1f} s"

@@ -27,7 +27,7 @@ from smartnav_graph.calibration.model import MagnetometerNoise
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe, exp, skew, turned
-from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, SessionState, State, Step, Window, key
 from smartnav_graph.streams import Magnetometer
 from smartnav_graph.timebase import NS
 
@@ -123,13 +123,13 @@ class MagnetometerBuilder:
     noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
     config: MagnetometerConfig = field(default_factory=MagnetometerConfig)
     name: str = "magnetometer"
-    stage: int = 1
+    stage: int = LAST_STAGE
 
     def __post_init__(self) -> None:
         self.soft_iron = np.reshape(self.noise.soft_iron, (3, 3))
         iron = np.asarray(self.noise.hard_iron_ut, dtype=np.float64)
-        self.iron = SessionState("H", self.name, "magnetometer_hard_iron_ut", iron, np.full(3, self.iron_sigma))
-        self.field = SessionState("F", self.name, "magnetometer_field_ut", self.field_ut, self.field_sigma)
+        self.iron = SessionState("H", self.name, IRON, iron, np.full(3, self.iron_sigma))
+        self.field = SessionState("F", self.name, STRENGTH, self.field_ut, self.field_sigma)
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where it has samples and the gyro tells how they turned."""
@@ -181,7 +181,8 @@ def unearthly(reading: Floats) -> float:
 def build(context: FactorContext) -> MagnetometerBuilder | None:
     """Builder of the session's magnetometer.
 
-    Readings whose first second is stronger than any field on Earth hold an uncalibrated hard iron of that size.
+    Readings whose first second is stronger than any field on Earth hold an uncalibrated hard iron of that size. Where
+    no positions tell the heading, the magnetometer takes part from the first pass on.
     """
     stream, config = context.session.magnetometer, context.config.magnetometer
     if stream is None or not config.enabled:
@@ -204,5 +205,6 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
 
 
 def first_second(stream: Magnetometer) -> Floats:
+        stage=LAST_STAGE if POSITIONS & set(context.session.streams()) else 0,
     """Readings (n, 3) of the first second."""
     return np.asarray(stream.field_ut[stream.t_ns <= stream.t_ns[0] + NS])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.magnetometer import IRON
 from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
 
 Floats = NDArray[np.float64]
@@ -40,7 +41,8 @@ class PriorBuilder:
 
     start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,
     sigma_bias (6,) m/s^2 and rad/s around `bias_mean`; rest_end_ns : end of a rest that begins at the first keyframe.
-    attitude is the mean of the rotation prior, that of `start` where there is none of its own.
+    attitude is the mean of the rotation prior, that of `start` where there is none of its own. magnetic_stage : its
+    heading comes from the magnetometer, and holds until the magnetometer's own factor speaks, from that stage on.
     Zero velocity at its keyframes ties tilt to accelerometer bias: a levelled start is off by the one as the other is.
     """
 
@@ -53,6 +55,7 @@ class PriorBuilder:
     bias_mean: gtsam.imuBias.ConstantBias
     rest_end_ns: int | None = None
     attitude: gtsam.Rot3 | None = None
+    magnetic_stage: int | None = None
     name: str = "prior"
     stage: int = 0
 
@@ -74,7 +77,7 @@ class PriorBuilder:
         pose = self.start.nav.pose()
         attitude = pose.rotation() if self.attitude is None else self.attitude
         nav_R_body = attitude.matrix()
-        rot = nav_R_body.T @ np.diag(self.sigma_rot**2) @ nav_R_body
+        rot = nav_R_body.T @ np.diag(self._sigma_rot(memory) ** 2) @ nav_R_body
         if self.sigma_pos is None:
             model = gtsam.noiseModel.Gaussian.Covariance(rot)
             step.add(tag, gtsam.PoseRotationPrior3D(x, attitude, model))
