@@ -126,6 +126,9 @@ class Initialiser:
     """Everything `run` needs.
 
     fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order; fix_sigma : their typical sigma, m
+    standstill : factors of their own say that a rest at the start does not move and does not turn
+    iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
+    field_start : where north is by the first seconds, where they tell
     """
 
     windows: Sequence[Window]
@@ -139,6 +142,10 @@ class Initialiser:
     declination_deg: float
     config: InitialiseConfig
     weak: PriorConfig = field(default_factory=PriorConfig)
+    standstill: bool = False
+    iron_sigma: float = 0.0
+    magnetic_stage: int | None = None
+    field_start: FieldStart | None = None
 
     def run(self, solve: Solve, given: Given | None) -> Initial:
         """The first state.
@@ -269,6 +276,7 @@ class Initialiser:
         told = (
             f"heading {heading:.1f} deg from the magnetometer"
             if magnetic is not None
+        prior = replace(prior, magnetic_stage=None if magnetic is None else self.magnetic_stage)
             else "heading and position set to zero (local frame)"
         )
         sentence = f"No absolute sensor: started from a rest of {rest.length_s:.1f} s; {told}."
@@ -277,7 +285,6 @@ class Initialiser:
 
     def _search(self, solve: Solve, rest: Rest | None) -> Initial:
         """Solve the first stretch from the likeliest start; a longer one while the heading stays open; from starts
-        prior = replace(prior, magnetic_stage=None if magnetic is None else self.magnetic_stage)
         all round where the fit is bad or the stretch cannot grow."""
         stretch, tried = self.config.stretch_s, 0
         while True:

@@ -33,6 +33,10 @@ from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
 
+# Streams whose positions tell the heading of whoever moves.
+POSITIONS = {"gnss", "control", "pose_fixes"}
+# Names of the states.
+IRON, STRENGTH = "magnetometer_hard_iron_ut", "magnetometer_field_ut"
 # Horizontal and vertical strength (uT, mean and sigma) of the field anywhere on Earth, for sessions without origin.
 SOMEWHERE = (np.array([25.0, 0.0]), np.array([12.0, 45.0]))
 # Local anomalies of the crust and of buildings beside the model's field, uT.
@@ -201,10 +205,10 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
         float(np.hypot(noise.hard_iron_sigma_ut, unearthly(first_second(stream) - np.array(noise.hard_iron_ut)))),
         noise,
         config,
+        stage=LAST_STAGE if POSITIONS & set(context.session.streams()) else 0,
     )
 
 
 def first_second(stream: Magnetometer) -> Floats:
-        stage=LAST_STAGE if POSITIONS & set(context.session.streams()) else 0,
     """Readings (n, 3) of the first second."""
     return np.asarray(stream.field_ut[stream.t_ns <= stream.t_ns[0] + NS])

@@ -96,3 +96,8 @@ class PriorBuilder:
             tag,
             gtsam.PriorFactorConstantBias(b, self.bias_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_bias)),
         )
+
+    def _sigma_rot(self, memory: Memory) -> Floats:
+        if self.magnetic_stage is None or memory.stage < self.magnetic_stage or IRON in memory.held:
+            return self.sigma_rot
+        return np.array([*self.sigma_rot[:2], UNKNOWN_ANGLE])
