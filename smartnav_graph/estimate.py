@@ -187,6 +187,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         forward=session.device.forward,
         config=config,
         weak=problem.config.prior,
+        **_north(problem),
     )
     return initialiser.run(solve, given)
 

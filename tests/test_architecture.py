@@ -12,7 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 ORDER = (
     *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps"),
     *("readers", "simulation", "vision"),
-    *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers", "first_seconds", "initialise", "config"),
+    *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
+    *("first_seconds", "first_field", "initialise", "config"),
     *("withhold", "problem", "revise", "assemble", "summary", "estimate"),
     *("evaluation", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )
