@@ -192,7 +192,6 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
     return initialiser.run(solve, given)
 
 
-def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats]:
 def _north(problem: Problem) -> dict[str, Any]:
     """What the magnetometer says of the start, for the initialiser."""
     builder = next((b for b in problem.builders if isinstance(b, MagnetometerBuilder)), None)
@@ -217,6 +216,7 @@ def _north(problem: Problem) -> dict[str, Any]:
     }
 
 
+def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats]:
     """Stamps and nav positions of all absolute measurements, in time order."""
     streams = [stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None]
     if not streams:

@@ -216,6 +216,7 @@ class Initialiser:
         velocity = np.full(3, self.weak.speed_sigma)
         if rest is not None:
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+            bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
             velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
             start=state,
@@ -273,10 +274,10 @@ class Initialiser:
         magnetic = self._magnetic_heading(rest)
         heading, sigma = magnetic if magnetic is not None else (0.0, 1e-3)
         prior = self._levelled(heading, np.zeros(3), 1e-3, sigma, rest)
+        prior = replace(prior, magnetic_stage=None if magnetic is None else self.magnetic_stage)
         told = (
             f"heading {heading:.1f} deg from the magnetometer"
             if magnetic is not None
-        prior = replace(prior, magnetic_stage=None if magnetic is None else self.magnetic_stage)
             else "heading and position set to zero (local frame)"
         )
         sentence = f"No absolute sensor: started from a rest of {rest.length_s:.1f} s; {told}."
