@@ -185,6 +185,7 @@ class VehicleBuilder:
     config: VehicleConfig = VehicleConfig()
     name: str = "vehicle"
     stage: int = 1
+    noise_groups: tuple[str, ...] = ("vehicle_lateral", "vehicle_vertical")
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
@@ -195,10 +196,8 @@ class VehicleBuilder:
             return
         rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
         force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
-        sigma = [
-            self.noise.lateral_sigma * memory.scale("vehicle_lateral"),
-            self.noise.vertical_sigma * memory.scale("vehicle_vertical"),
-        ]
+        scales = [memory.scale(group) for group in self.noise_groups]
+        sigma = np.array([self.noise.lateral_sigma, self.noise.vertical_sigma]) * scales
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
         keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.config)))
         step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))
