@@ -16,11 +16,13 @@ import pytest
 from exact import LEVER, START_NS, Graph, Recording, assemble, assert_derivative, record
 from scipy.stats import chi2
 
+from smartnav_graph.calibration.model import Calibration, MagnetometerNoise
 from smartnav_graph.errors import SessionError
 from smartnav_graph.graph import LAST_STAGE, Memory, kind_of
 from smartnav_graph.session import Device, Session
+from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
-from smartnav_graph.streams import Velocity, WheelSpeed
+from smartnav_graph.streams import Magnetometer, Velocity, WheelSpeed
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 Wrong = Callable[[Session], Session]
@@ -36,7 +38,7 @@ class Case:
     record : its recording, exact for None, noisy for a seed; honest : largest |component| at the truth, in sigma
     mutations : name -> (mistake, rms over the rows it must exceed, in sigma); known : true session states
     stream : stream and field whose broken numbers are refused; noisy : whether its sigma is that of simulated noise
-    lookahead_s : what it may see of the time after a keyframe
+    lookahead_s : what it may see of the time after a keyframe; cut : inertial samples of the shorter recording
     """
 
     record: Record
@@ -46,6 +48,7 @@ class Case:
     stream: tuple[str, str] | None = None
     noisy: bool = True
     lookahead_s: float = 0.0
+    cut: int = 1300
 
 
 # --- recordings -------------------------------------------------------------------------------------------------------
@@ -90,6 +93,35 @@ def car(seed: int | None) -> Recording:
 
 # pitch, yaw, the rear axle seen from the phone in the vehicle's own axes (forward, left, up), no compliance
 CAR_STATES = {"vehicle_mount": [0.0, -YAW, -AHEAD, RIGHT, -ABOVE, 0.0, 0.0, 0.0]}
+
+
+NAV_FIELD = np.array([0.0, 19.0, -45.0])  # uT, magnetic north is north
+IRON = np.array([12.0, -30.0, 7.0])
+FIELD_STATES = {"magnetometer_hard_iron_ut": IRON, "magnetometer_field_ut": NAV_FIELD[1:]}
+
+
+@cache
+def with_field(seed: int | None) -> Recording:
+    """A figure eight with a magnetometer at 20 Hz; no iron nearby."""
+    made = record(seed=seed)
+    t = np.arange(0.013, 29.9, 0.05)
+    noise = MagnetometerNoise(sigma_ut=0.5, disturbance_ut=0.0)
+    white = np.random.default_rng((0 if seed is None else seed, 2)).standard_normal((len(t), 3))
+    field_ut = np.einsum("nji,j->ni", made.trajectory.sample(t).nav_R_body, NAV_FIELD) + IRON
+    field_ut += 0.0 if seed is None else noise.sigma_ut * white
+    stream = Magnetometer(t_ns=START_NS + ns_from_seconds(t), field_ut=field_ut)
+    return replace(
+        made, session=made.session.replace(magnetometer=stream, calibration=Calibration(magnetometer_noise=noise))
+    )
+
+
+@cache
+def afoot(seed: int | None) -> Recording:
+    """A straight walk of 70 s that nothing but the inertial data tell of."""
+    way = Legs([Leg(70.0, 1.35)], speed=1.35, heading_deg=30.0)
+    walk = Trajectory(way, held_deg=(0.0, 35.0, 4.0), sway=motions.walk(10.0, np.random.default_rng(0)).sway)
+    made = record(walk, seed=seed)
+    return replace(made, session=made.session.replace(gnss=None, control=None))
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------
@@ -147,6 +179,31 @@ CASES: dict[str, Case] = {
         },
         stream=("velocity", "velocity"),
         lookahead_s=0.5,
+    ),
+    "magnetometer": Case(
+        with_field,
+        0.1,  # 20 samples of 0.5 uT; between samples the turn is taken about one axis
+        {
+            "gauss": (_column("magnetometer", "field_ut", lambda b: b / 100.0), 100.0),
+            "sign": (_column("magnetometer", "field_ut", np.negative), 100.0),
+            "axes swapped": (_column("magnetometer", "field_ut", lambda b: b[:, [1, 0, 2]]), 100.0),
+            # 1.5 rad/s in 49 uT, and the mean of half a second's turn the wrong way
+            "clock late by 0.1 s": (_late("magnetometer"), 5.0),
+            "rate sign": (_column("imu", "gyro", np.negative), 10.0),
+        },
+        known=FIELD_STATES,
+        stream=("magnetometer", "field_ut"),
+    ),
+    "gravity": Case(
+        afoot,
+        0.5,  # steps of 0.53 s do not fit into 4 s
+        {
+            # twice gravity, and the pitch of 35 deg, for a sigma of 0.2 m/s^2
+            "force sign": (_column("imu", "accel", lambda f: f * [-1.0, 1.0, 1.0]), 2.0),
+            "axes swapped": (_column("imu", "accel", lambda f: f[:, [1, 0, 2]]), 15.0),
+        },
+        noisy=False,
+        cut=4500,
     ),
     "gnss_velocity": Case(
         car,
@@ -226,13 +283,14 @@ def test_whitened_residuals_of_simulated_noise_have_unit_variance(sensor):
 def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor):
     case = CASES[sensor]
     made = case.record(None)
-    cut = int(made.session.imu.t_ns[1300])
+    cut = int(made.session.imu.t_ns[case.cut])
     shorter = made.session.replace(
         **{name: stream.take(stream.t_ns <= cut) for name, stream in made.session.streams().items()}
     )
     full = graph_of(sensor)
     part = assemble(shorter, made.truth, memory=MEMORY, known=case.known)
-    last = max(w.t1_ns for w in part.windows if w.rows)  # later windows end where the recording does
+    # without fixes keyframes stand at full seconds; else later windows end where the recording does
+    last = max((w.t1_ns for w in part.windows if w.rows), default=cut)
     known = min(last, cut - ns_from_seconds(case.lookahead_s))
     pairs = [[(tag, f) for tag, f in graph.rows(sensor) if tag.t_ns <= known] for graph in (full, part)]
     assert len(pairs[0]) == len(pairs[1]) > 8
