@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import frames
-from smartnav_graph.calibration.model import Calibration, GnssNoise
+from smartnav_graph.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.session import Device, Mount, Session
@@ -183,7 +183,13 @@ def _calibration(scenario: Scenario) -> Calibration:
         correlated_vertical_sigma=1.5 * model.markov_m,
         correlated_time=model.markov_s,
     )
-    return Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
+    made = Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
+    if (mag := scenario.magnetometer) is not None:  # what stays alike for seconds is simulated as passing iron only
+        iron = MagnetometerNoise(sigma_ut=mag.sigma_ut, disturbance_ut=0.0, hard_iron_sigma_ut=mag.hard_iron_sigma_ut)
+        made = replace(made, magnetometer_noise=iron)
+    if (baro := scenario.barometer) is not None and baro.walk_hpa > 0:
+        made = replace(made, barometer_noise=BarometerNoise(baro.sigma_hpa, baro.walk_hpa))
+    return made
 
 
 def magnetic_field_ut() -> NDArray[np.float64]:
