@@ -31,10 +31,9 @@ from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.problem import Problem, prepare
 from smartnav_graph.revise import position_builders, revise
 from smartnav_graph.session import Session
-from smartnav_graph.smoothers import Smoother
+from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import Estimate, largest_difference
-from smartnav_graph.smoothers.incremental import Incremental
 from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.summary import summarise
@@ -299,7 +298,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     initial = initialise(problem, longest_s=30.0)
     clock.lap("initialise")
     options = problem.config.replay
-    smoother = Incremental(options, problem.session.t0_ns)
+    smoother = incremental(options, problem.session.t0_ns)
     builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
     memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering, stage=LAST_STAGE)

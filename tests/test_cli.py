@@ -14,6 +14,7 @@ from smartnav_graph import estimate
 from smartnav_graph.cli import COMMANDS, command_class, demo, main
 from smartnav_graph.cli.options import Estimating, join_values, parse
 from smartnav_graph.run_folder import read_run
+from smartnav_graph.smoothers.incremental import Incremental
 
 START = "--initial 0,0,0,0,3,30"
 FAST = ("--to", "20", *START.split(), "--quiet")
@@ -72,14 +73,14 @@ def test_replay_writes_both_solutions(call, workshop):
 
 
 def test_an_interrupted_replay_leaves_a_valid_partial_run(call, workshop, tmp_path, monkeypatch):
-    update = estimate.Incremental.update
+    update = Incremental.update
 
     def interrupted(self, step):
         if step.index == 9:
             raise KeyboardInterrupt
         update(self, step)
 
-    monkeypatch.setattr(estimate.Incremental, "update", interrupted)
+    monkeypatch.setattr(Incremental, "update", interrupted)
     code, out, err = call(
         f"replay eight --out {tmp_path}/part --lag 5 --replay.polish false --to 20 --initial 0,0,0,0,3,30"
     )

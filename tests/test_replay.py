@@ -12,9 +12,10 @@ from smartnav_graph.config import Config
 from smartnav_graph.graph import Memory, build_step
 from smartnav_graph.problem import prepare
 from smartnav_graph.run_folder import read_run, write_run
+from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import largest_difference
-from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
+from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
 from smartnav_graph.timebase import NS
 
@@ -41,7 +42,7 @@ def test_batch_and_converged_isam2_agree_on_the_same_steps(seed):
     problem = prepare(sn.simulate("figure-eight-60s", seed), Config())
     steps = build_steps(problem)
     batch = Batch(problem.config.batch, SolveConfig(200, 1e-15, 1e-10), None, problem.session.t0_ns)
-    causal = Incremental(ReplayConfig("isam2", relinearize=1e-7), problem.session.t0_ns)
+    causal = incremental(ReplayConfig("isam2", relinearize=1e-7), problem.session.t0_ns)
     for step in steps:
         batch.update(step)
         causal.update(step)

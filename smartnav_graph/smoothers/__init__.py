@@ -6,6 +6,9 @@ from typing import Protocol
 
 from smartnav_graph.graph import State, Step
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.fixed_lag import FixedLag
+from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
+from smartnav_graph.smoothers.isam2 import Isam2
 
 
 class Smoother(Protocol):
@@ -22,3 +25,8 @@ class Smoother(Protocol):
     def estimate(self) -> Estimate:
         """States of all keyframes with their covariance, after everything taken so far."""
         ...
+
+
+def incremental(config: ReplayConfig, t0_ns: int) -> Incremental:
+    """The smoother that a replay asks for."""
+    return (FixedLag if config.smoother == "fixed-lag" else Isam2)(config, t0_ns)

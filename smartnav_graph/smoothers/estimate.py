@@ -196,6 +196,13 @@ def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
     return Posterior(joint, following, later)
 
 
+def latest_covariance(net: Any, index: int) -> Floats:
+    """Covariance (15, 15) of keyframe `index`, the last that a Bayes net eliminates, on GTSAM's tangents."""
+    names = [key(letter, index) for letter in KEYFRAME_LETTERS]
+    tail = (net.at(i) for i in range(net.size() - len(names), net.size()))
+    return _Joint.empty().conditioned(_slices(names), {conditional.keys()[0]: conditional for conditional in tail})[0]
+
+
 def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, Any]) -> dict[int, int]:
     """The earliest group that is conditioned on each state."""
     found: dict[int, int] = {}

@@ -12,6 +12,7 @@ from smartnav_graph.config import Config
 from smartnav_graph.graph import KEYFRAME_LETTERS, Memory, State, Step, key
 from smartnav_graph.problem import prepare
 from smartnav_graph.smoothers import estimate as room
+from smartnav_graph.smoothers.whole_graph import custom_factor
 
 
 @pytest.fixture(scope="module")
@@ -44,19 +45,45 @@ def test_body_covariance_in_nav_axes():
     )  # velocity is in nav already
 
 
-def test_covariance_of_all_keyframes_is_that_of_gtsam(solved):
+def as_factors(estimate: room.Estimate) -> gtsam.NonlinearFactorGraph:
+    """The same problem as factors of GTSAM alone: one CustomFactor a row, a prior a session state."""
     graph = gtsam.NonlinearFactorGraph()
-    for _, factor in solved.factors:
+    for _, factor in estimate.factors:
         graph.push_back(factor)
-    marginals = gtsam.Marginals(graph, solved.values)
-    for i in (0, 7, solved.indices[-1]):
-        R = solved.values.atPose3(key("X", i)).rotation().matrix()
-        body = marginals.marginalCovariance(key("X", i))
-        both = np.kron(np.eye(2), R)
-        assert solved.covariance[i, :6, :6] == pytest.approx(both @ body @ both.T, rel=1e-5, abs=1e-12)
-        assert solved.covariance[i, 9:, 9:] == pytest.approx(
-            marginals.marginalCovariance(key("B", i)), rel=1e-5, abs=1e-14
-        )
+    for block in estimate.blocks:
+        for row in np.flatnonzero(block.used):
+            graph.push_back(custom_factor(block, int(row), {}))
+    for state in estimate.session.values():
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas(state.prior_sigma)
+        graph.push_back(gtsam.PriorFactorVector(state.key, state.prior_mean, sigmas))
+    return graph
+
+
+def on_tangent(marginals: gtsam.Marginals, names: list[int]) -> np.ndarray:
+    """Joint covariance of states from GTSAM, in this order."""
+    joint = marginals.jointMarginalCovariance(names)
+    return np.block([[joint.at(one, other) for other in names] for one in names])
+
+
+def test_covariance_of_all_keyframes_is_that_of_gtsam(solved):
+    """Joint of each keyframe, with the next, and of the session states, which touch them all."""
+    assert solved.session["gnss_time_offset_s"].sigma[0] < 0.1 and not solved.session["gnss_time_offset_s"].held
+    marginals = gtsam.Marginals(as_factors(solved), solved.values)
+    states = [[key(letter, i) for letter in KEYFRAME_LETTERS] for i in solved.indices]
+    for i in (0, 7, len(states) - 1):
+        turn = np.eye(15)
+        turn[:3, :3] = turn[3:6, 3:6] = solved.values.atPose3(states[i][0]).rotation().matrix()
+        own = on_tangent(marginals, states[i])
+        scale = np.sqrt(np.outer(np.diag(own), np.diag(own)))
+        np.testing.assert_allclose(solved.marginals.joint[i] / scale, own / scale, atol=1e-5)
+        np.testing.assert_allclose(solved.covariance[i], turn @ own @ turn.T, rtol=1e-4, atol=1e-12)
+    for i in (0, 12, len(states) - 2):
+        both = on_tangent(marginals, states[i] + states[i + 1])
+        sigma = np.sqrt(np.diag(both))
+        cross = both[:15, 15:] / np.outer(sigma[:15], sigma[15:])
+        np.testing.assert_allclose(solved.marginals.following[i] / np.outer(sigma[:15], sigma[15:]), cross, atol=1e-5)
+    for state in solved.session.values():
+        np.testing.assert_allclose(state.covariance, marginals.marginalCovariance(state.key), rtol=1e-5)
 
 
 def test_covariances_are_symmetric_and_positive(solved):
@@ -66,9 +93,7 @@ def test_covariances_are_symmetric_and_positive(solved):
 
 def test_the_solution_is_stationary(solved):
     """The gradient of the cost vanishes: an undamped step from the solution goes nowhere."""
-    graph = gtsam.NonlinearFactorGraph()
-    for _, factor in solved.factors:
-        graph.push_back(factor)
+    graph = as_factors(solved)
     step = graph.linearize(solved.values).optimize()
     assert np.abs(step.vector()).max() < 1e-4  # rad, m, m/s
     assert solved.cost == pytest.approx(graph.error(solved.values)) and solved.converged

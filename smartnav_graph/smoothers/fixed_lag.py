@@ -1,0 +1,186 @@
+"""The last seconds of the graph, solved anew at every step; what is older is marginalised into a linear factor.
+
+A window of seconds holds some ten to fifty keyframes: linearised as a whole, blocks by the stack, and eliminated in
+time order, it costs a few milliseconds whatever has moved, session states included. QR, because Cholesky gives up on
+yaw that is only weakly known.
+
+Source: Sibley, Matthies, Sukhatme (2010), Sliding window filter with application to planetary landing, J. Field
+Robotics 27(5); Dong-Si, Mourikis (2011), Motion tracking with fixed-lag smoothing, ICRA.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.graph import KEYFRAME_LETTERS, Block, SessionState, State, Step, key, kind_of
+from smartnav_graph.smoothers.estimate import copy_state, latest_covariance, state_at
+from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
+from smartnav_graph.smoothers.whole_graph import WholeGraph, session_prior
+
+Floats = NDArray[np.float64]
+Item = TypeVar("Item")
+
+# Gauss-Newton steps at most a step: the next one goes on from there.
+MOST_STEPS = 2
+# Share of a state's trust that a step may move it by and need no further one.
+SETTLED = 0.05
+# In place of the oldest keyframe where a factor touches session states alone: it never leaves.
+NEVER = 1 << 62
+
+
+class FixedLag(Incremental):
+    """Sliding window behind the one interface.
+
+    Live factors and blocks stand with the oldest keyframe they touch, which takes them along when it leaves.
+    """
+
+    def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
+        super().__init__(config, t0_ns)
+        self._inside: deque[Step] = deque()
+        self._session: dict[int, SessionState] = {}
+        self._held: dict[int, Floats] = {}
+        self._factors: list[tuple[int, Any]] = []
+        self._blocks: list[tuple[int, Block]] = []
+        self._live, self._left = gtsam.Values(), gtsam.Values()
+        self._net: Any = None
+
+    def _take(self, step: Step) -> None:
+        self._make_room(step)
+        self._drop_late(step)
+        self._insert(step)
+        graph = WholeGraph((f for _, f in self._factors), (b for _, b in self._blocks), self._held)
+        order = self._order()
+        trust = np.concatenate([kind_of(name).trust for name in list(self._live.keys())])
+        for _ in range(MOST_STEPS):
+            self._net = _eliminated(graph.linearize(self._live), order)
+            delta = self._net.optimize()
+            _check(delta)
+            self._live = self._live.retract(delta)
+            if (np.abs(delta.vector()) < SETTLED * self.config.relinearize * trust).all():
+                break
+
+    def _insert(self, step: Step) -> None:
+        """Make the step's states and factors live; a session state comes with its prior, once."""
+        self._inside.append(step)
+        self._live.insert(step.values())
+        self._held |= step.held
+        for name, state in step.session.items():
+            if name not in self._session:
+                self._live.insert(name, state.initial)
+                self._factors.append((NEVER, session_prior(state)))
+        self._session |= step.session
+        self._factors += [(_oldest(factor.keys()), factor) for _, factor in step.factors]
+        for block in step.blocks:
+            self._blocks += _parted(block)
+
+    def _drop_late(self, step: Step) -> None:
+        """Leave out, and count, rows that speak of keyframes which have left the lag."""
+        oldest = self._inside[0].index if self._inside else step.index
+        kept = []
+        for block in step.blocks:
+            gone = [_oldest(keys) < oldest for keys in block.keys]
+            self.dropped[block.sensor] += sum(gone)
+            kept.append(_only(block, [not late for late in gone]) if any(gone) else block)
+        step.blocks = kept
+
+    def _make_room(self, step: Step) -> None:
+        """Marginalise the keyframes that are older than the lag, and keep their last estimate."""
+        leaving = []
+        while self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
+            leaving.append(self._inside.popleft())
+        if not leaving:
+            return
+        last = leaving[-1].index
+        factors, self._factors = _split(self._factors, last)
+        blocks, self._blocks = _split(self._blocks, last)
+        order = gtsam.Ordering()
+        for name in (name for gone in leaving for name in gone.names()):
+            order.push_back(name)
+        linear = WholeGraph(factors, blocks, self._held).linearize(self._live)
+        _, rest = linear.eliminatePartialSequential(order, gtsam.EliminateQR)
+        for i in range(rest.size()):
+            factor = rest.at(i)
+            if factor is not None and not factor.empty():
+                self._factors.append((_oldest(factor.keys()), gtsam.LinearContainerFactor(factor, self._live)))
+        for gone in leaving:
+            copy_state(gone, self._live, self._left)
+            for name in gone.names():
+                self._live.erase(name)
+
+    def _order(self) -> gtsam.Ordering:
+        """Chronological, the latest keyframe last of all: its marginal is then the end of the elimination."""
+        latest = self._inside[-1]
+        own = [key(letter, latest.index) for letter in KEYFRAME_LETTERS]
+        order = gtsam.Ordering()
+        for step in self._inside:
+            for name in step.names():
+                if name not in own:
+                    order.push_back(name)
+        for name in [*self._session, *own]:
+            order.push_back(name)
+        return order
+
+    def _state(self, step: Step) -> State:
+        return state_at(self._live, step.index, step.t_ns)
+
+    def _marginal(self, step: Step) -> Floats:
+        return latest_covariance(self._net, step.index)
+
+    def values(self) -> Any:
+        """Best estimate of every state so far (gtsam.Values): as it left the lag, or as it is now."""
+        values = gtsam.Values(self._left)
+        values.insert(self._live)
+        return values
+
+
+def _eliminated(linear: Any, order: gtsam.Ordering) -> Any:
+    """Bayes net of a linear system; RuntimeError also where a state has no factor at all."""
+    try:
+        return linear.eliminateSequential(order, gtsam.EliminateQR)
+    except ValueError as error:
+        missing = sorted({order.at(i) for i in range(order.size())} - set(linear.keys()))
+        if not missing:
+            raise
+        raise RuntimeError(f"(Symbol: {gtsam.Symbol(missing[-1]).string()})") from error
+
+
+def _oldest(keys: Iterable[int]) -> int:
+    """Index of the oldest keyframe among states."""
+    return min((gtsam.symbolIndex(name) for name in keys if kind_of(name).scope != "session"), default=NEVER)
+
+
+def _split(items: Sequence[tuple[int, Item]], last: int) -> tuple[list[Item], list[tuple[int, Item]]]:
+    """What keyframes up to `last` take along, and the rest."""
+    return [item for oldest, item in items if oldest <= last], [pair for pair in items if pair[0] > last]
+
+
+def _only(block: Block, mask: Sequence[bool]) -> Block:
+    """The rows (m,) of a block that a mask leaves."""
+    rows = [i for i, kept in enumerate(mask) if kept]
+    return replace(
+        block,
+        keys=[block.keys[i] for i in rows],
+        data=block.data[rows],
+        rows=tuple(block.rows[i] for i in rows),
+        used=tuple(block.used[i] for i in rows),
+    )
+
+
+def _parted(block: Block) -> list[tuple[int, Block]]:
+    """A block in parts of rows that share their oldest keyframe; rows not used stay out."""
+    oldest = [_oldest(keys) if used else None for keys, used in zip(block.keys, block.used, strict=True)]
+    return [(index, _only(block, [o == index for o in oldest])) for index in dict.fromkeys(oldest) if index is not None]
+
+
+def _check(delta: Any) -> None:
+    """Refuse a step that is no number: a state is not determined."""
+    if not np.isfinite(delta.vector()).all():
+        names = [name for name in list(delta.keys()) if not np.isfinite(delta.at(name)).all()]
+        raise RuntimeError(f"(Symbol: {gtsam.Symbol(names[0]).string()})")
