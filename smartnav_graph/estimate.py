@@ -171,15 +171,17 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         most = min(config.max_stretch_s, longest_s)
         config = replace(config, max_stretch_s=most, stretch_s=min(config.stretch_s, most))
 
-    def solve(prior: PriorBuilder, count: int) -> tuple[Estimate, Memory]:
-        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, Memory(), unsure=True)
+    def solve(prior: PriorBuilder, count: int, memory: Memory) -> tuple[Estimate, Memory]:
+        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, memory, unsure=True)
         return estimate, memory
 
     given = Given.parse(problem.config.run.initial) if problem.config.run.initial else None
+    t_ns, positions, sources = _absolute_positions(problem)
     initialiser = Initialiser(
         windows=problem.windows,
         imu=session.require_imu(),
-        fixes=_absolute_positions(problem),
+        fixes=(t_ns, positions),
+        sources=sources,
         fix_sigma=max((float(np.median(b.sigma)) for b in position_builders(problem.builders)), default=1.0),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
@@ -215,15 +217,16 @@ def _north(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats]:
-    """Stamps and nav positions of all absolute measurements, in time order."""
-    streams = [stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None]
+def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats, list[tuple[str, int]]]:
+    """Stamps, nav positions, and sensor and row of all absolute measurements, in time order."""
+    streams = {name: stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None}
     if not streams:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    t = np.concatenate([stream.t_ns for stream in streams])
-    p = np.concatenate([problem.session.nav_position(stream) for stream in streams])
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), []
+    t = np.concatenate([stream.t_ns for stream in streams.values()])
+    p = np.concatenate([problem.session.nav_position(stream) for stream in streams.values()])
+    sources = [(name, row) for name, stream in streams.items() for row in range(len(stream))]
     order = np.argsort(t, kind="stable")
-    return t[order], p[order]
+    return t[order], p[order], [sources[i] for i in order]
 
 
 def smooth(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:

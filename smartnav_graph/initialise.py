@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph import frames
 from smartnav_graph.calibration.model import ImuNoise
+from smartnav_graph.consensus import Agreed, Agreement, curve_of, distinct
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
 from smartnav_graph.first_field import FieldStart
@@ -34,6 +35,9 @@ Floats = NDArray[np.float64]
 # a start must not look good because it rejects what contradicts it.
 GOOD_COST = 2.5
 REJECTION_COST = 10.0
+# Share of the keyframes whose fixes a good start may reject beyond those that disagreed with it before.
+MORE_REJECTED = 0.05
+LEAST_RATE_SIGMA = 3e-4  # rad/s
 # Tilt (rad) that levelling by the accelerometer may be off.
 LEVELLED = 0.1
 # Heading (rad) that iron nearby may turn a magnetometer by.
@@ -117,8 +121,12 @@ class Initial:
         }
 
 
-# Solves the first `count` windows from a prior: the loop of estimate.py, handed down.
-Solve = Callable[[PriorBuilder, int], tuple[Estimate, Memory]]
+# Solves the first `count` windows from a prior and a memory: the loop of estimate.py, handed down.
+Solve = Callable[[PriorBuilder, int, Memory], tuple[Estimate, Memory]]
+
+
+def _rejections(memory: Memory) -> int:
+    return sum(len(rows) for rows in memory.rejected.values())
 
 
 @dataclass(frozen=True)
@@ -126,6 +134,7 @@ class Initialiser:
     """Everything `run` needs.
 
     fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order; fix_sigma : their typical sigma, m
+    sources : sensor and row of each fix
     standstill : factors of their own say that a rest at the start does not move and does not turn
     iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
     field_start : where north is by the first seconds, where they tell
@@ -146,6 +155,7 @@ class Initialiser:
     iron_sigma: float = 0.0
     magnetic_stage: int | None = None
     field_start: FieldStart | None = None
+    sources: Sequence[tuple[str, int]] = ()
 
     def run(self, solve: Solve, given: Given | None) -> Initial:
         """The first state.
@@ -285,24 +295,27 @@ class Initialiser:
         return Initial(prior, "static", sentence, heading, sigma, stretch, 1, Memory())
 
     def _search(self, solve: Solve, rest: Rest | None) -> Initial:
-        """Solve the first stretch from the likeliest start; a longer one while the heading stays open; from starts
-        all round where the fit is bad or the stretch cannot grow."""
+        """Refine the start on which most fixes of the first stretch agree; others where it fits badly; a longer stretch
+        while the heading stays open."""
         stretch, tried = self.config.stretch_s, 0
         while True:
             count = self._count(stretch)
+        before: list[State] = []
             last = stretch >= self.config.max_stretch_s or count >= len(self.windows)
             results: list[tuple[float, Initial]] = []
-            for state in self._starts(count, rest):
+            for state, memory in self._candidates(count, rest, before):
                 tried += 1
-                results += self._attempt(solve, state, rest, count)
-                if len(results) == 1 and results[0][0] < GOOD_COST * count and (self._sure(results[0][1]) or not last):
-                    break  # a good fit from the likeliest start
+                found, fits = self._attempt(solve, state, memory, rest, count)
+                results += found
+                if fits and (last <= self._sure(found[0][1])):
+                    break
             if results:
                 best = min(results, key=lambda item: item[0])[1]
                 if last or self._sure(best):
                     return replace(best, starts=tried)
             elif last:
                 raise SolverError(
+                before = [best.prior.start]
                     "initialisation",
                     f"no start converges on the first {count} keyframes",
                     "inertial data and fixes of the same motion",
@@ -313,14 +326,19 @@ class Initialiser:
     def _sure(self, initial: Initial) -> bool:
         return initial.sigma_heading_deg < self.config.good_heading_deg
 
-    def _attempt(self, solve: Solve, state: State, rest: Rest | None, count: int) -> list[tuple[float, Initial]]:
-        """Cost and start refined from `state`; nothing where it does not converge."""
+    def _attempt(
+        self, solve: Solve, state: State, memory: Memory, rest: Rest | None, count: int
+    ) -> tuple[list[tuple[float, Initial]], bool]:
+        """Cost and start refined from `state`, nothing where it does not converge; whether the kept fixes fit, and
+        hardly any was rejected that did not disagree before."""
+        outside = _rejections(memory)
         try:
-            estimate, memory = solve(self._prior(state, rest), count)
+            estimate, learnt = solve(self._prior(state, rest), count, memory)
         except SolverError:
-            return []
-        rejected = sum(len(rows) for rows in memory.rejected.values())
-        return [(estimate.cost + REJECTION_COST * rejected, self._found(estimate, memory, rest, count))]
+            return [], False
+        rejected = _rejections(learnt)
+        fits = estimate.cost < GOOD_COST * count and rejected <= outside + max(1.0, MORE_REJECTED * count)
+        return [(estimate.cost + REJECTION_COST * rejected, self._found(estimate, learnt, rest, count))], fits
 
     def _count(self, stretch_s: float) -> int:
         """Windows up to `stretch_s` after the first fix."""
@@ -330,6 +348,41 @@ class Initialiser:
 
     def _starts(self, count: int, rest: Rest | None) -> list[State]:
         """First states to try: the inertial curve laid on the fixes, then headings all round."""
+    def _candidates(self, count: int, rest: Rest | None, before: Sequence[State]) -> list[tuple[State, Memory]]:
+        """First states to try, those that most fixes agree on first, with the rows that do not."""
+        windows = self.windows[:count]
+        ends = np.array([w.t1_ns for w in windows])
+        used = self.fixes[0] <= ends[-1]
+        t_ns, fixes = (column[used] for column in self.fixes)
+        starts = [*before, *self._starts(count, rest)]
+        mean, sigma = np.zeros(6), np.array([self.noise.accel_bias_sigma] * 3 + [self.noise.gyro_bias_sigma] * 3)
+        if rest is not None:
+            mean[3:], sigma[3:] = rest.gyro, max(rest.gyro_sigma, LEAST_RATE_SIGMA)
+        at = starts[0].bias.vector() if before else mean
+        curve = curve_of(windows, at, self.noise, sigma)
+        rows = np.minimum(np.searchsorted(ends, t_ns), count - 1)
+        problem = Agreement(curve.at(rows), fixes, (t_ns - ends[0]) / NS, self.fix_sigma, self.gravity, mean)
+        agreed: list[Agreed] = []
+        for state in starts:
+            agreed.append(problem.agree(state.nav.attitude().matrix(), state.nav.position(), state.nav.velocity()))
+        chosen = distinct(agreed)[: self.config.starts]
+        return [(self._state_of(a), self._memory_of(a, np.flatnonzero(used))) for a in chosen]
+
+    def _state_of(self, agreed: Agreed) -> State:
+        bias = gtsam.imuBias.ConstantBias(agreed.found[:3], agreed.found[3:6])
+        nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(agreed.R), agreed.p), agreed.v)
+        return State(0, self.windows[0].t1_ns, nav, bias)
+
+    def _memory_of(self, agreed: Agreed, used: NDArray[np.intp]) -> Memory:
+        """The rows that disagree as rejected; none where the start explains less than half of them."""
+        outside = used[agreed.outside]
+        if not len(outside) or 2 * len(outside) > len(used) or not self.sources:
+            return Memory()
+        rejected: dict[str, set[int]] = {}
+        for name, row in (self.sources[i] for i in outside):
+            rejected.setdefault(name, set()).add(row)
+        return Memory(phase="gated", rejected={name: frozenset(rows) for name, rows in rejected.items()})
+
         windows = self.windows[:count]
         magnetic = self._magnetic_heading(rest)
         t_ns, fixes = self.fixes

@@ -13,8 +13,8 @@ ORDER = (
     *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps"),
     *("readers", "simulation", "vision"),
     *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
-    *("first_seconds", "first_field", "initialise", "config"),
-    *("withhold", "problem", "revise", "assemble", "summary", "estimate"),
+    *("first_seconds", "first_field", "graduated", "consensus", "initialise", "config"),
+    *("withhold", "problem", "variance", "revise", "assemble", "summary", "estimate"),
     *("evaluation", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )
 DOOR = "__init__"  # it alone may look everywhere

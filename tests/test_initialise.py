@@ -243,7 +243,7 @@ def initialiser(session, *, fixes: bool = False, **changes) -> Initialiser:
     return Initialiser(**{**values, **changes})
 
 
-def no_solver(prior, count):
+def no_solver(prior, count, memory):
     raise AssertionError("nothing to solve")
 
 

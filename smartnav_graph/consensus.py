@@ -1,0 +1,222 @@
+"""The first state on which most of the first fixes agree: the inertial curve laid on them, outliers and all.
+
+    fix_k = p0 + v0 t_k - g t_k^2 / 2 + R (c_k + C_k b)
+
+c_k is the doubly integrated specific force in the first body frame, C_k its derivative by the unknowns b: the six
+inertial biases, and a change of velocity and of attitude after every gap and every ten seconds of noise. Solved by
+Gauss-Newton inside graduated non-convexity: a hundredth of the work of a factor graph, and neither single outliers nor
+bursts among the first fixes bend it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from smartnav_graph import graduated
+from smartnav_graph.calibration.model import ImuNoise
+from smartnav_graph.factors.observation import skew
+from smartnav_graph.graph import Window
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+# What neither curve nor fix knows, metres: lever arms, clock offsets of a tenth of a second, wandering errors.
+UNTOLD = 2.0
+# Noise of what nobody measured inside a gap: m/s^2 and rad/s per sqrt(Hz).
+GAP_ACCEL, GAP_GYRO = 0.25, 0.05
+KICK_S = 10.0
+PROBABILITY = 0.999
+GROWTH = 1.4  # of the control, a step
+STEPS = 80
+MOST_FIXES = 300
+ALIKE = 0.2  # rad, between starts that lead to the same solution
+FIRST_STEPS = 5
+DAMPING = (1e-9, 1e-3, 1e-1, 1e1, 1e3)
+LEAST_CURVATURE = 1e-6  # of a turn that nothing tells
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Inertial curve at the end of each window: place (n, 3) m in the first body frame; its derivative (n, 3, q) by
+    what is not known of it, the biases about `bias` (6,) first; the prior sigma (q,) of that."""
+
+    place: Floats
+    by: Floats
+    sigma: Floats
+    bias: Floats
+
+    def at(self, rows: NDArray[np.intp]) -> Curve:
+        return replace(self, place=self.place[rows], by=self.by[rows])
+
+
+@dataclass(frozen=True)
+class Agreed:
+    """A first state: nav_R_body (3, 3), position and velocity (3,), what was found of the curve (q,), biases first;
+    squares (m,) of the fixes' residuals."""
+
+    R: Floats
+    p: Floats
+    v: Floats
+    found: Floats
+    square: Floats
+
+    @property
+    def outside(self) -> NDArray[np.bool_]:
+        """Mask (m,) of the fixes that do not agree."""
+        return self.square > _limit()
+
+    @property
+    def cost(self) -> float:
+        return graduated.truncated(self.square, _limit())
+
+
+def _limit() -> float:
+    return float(chi2(3).ppf(PROBABILITY))
+
+
+def _integrated(windows: Sequence[Window], bias: Floats) -> tuple[Floats, Floats]:
+    """Specific force integrated twice and once, (n, 3) each, at the end of each window, in the first body frame."""
+    constant = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
+    pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), constant)
+    integrate, place, speed = pim.integrateMeasurement, [], []
+    for window in windows:
+        for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
+            integrate(accel, gyro, dt)
+        place.append(pim.deltaPij())
+        speed.append(pim.deltaVij())
+    return np.array(place).reshape(-1, 3), np.array(speed).reshape(-1, 3)
+
+
+def curve_of(windows: Sequence[Window], bias: Floats, noise: ImuNoise, bias_sigma: Floats) -> Curve:
+    """The curve of windows integrated at `bias` (6,), known to `bias_sigma` (6,)."""
+    place, speed = _integrated(windows, bias)
+    step = np.array([1e-2] * 3 + [1e-4] * 3)
+    by = [(_integrated(windows, bias + delta)[0] - place) / delta.max() for delta in np.diag(step)]
+    t = np.array([w.t1_ns - windows[0].t0_ns for w in windows]) / NS
+    sigmas = [bias_sigma]
+    for k, kick in _kicks(windows, t, noise):
+        since = np.maximum(t - t[k], 0.0)[:, None]
+        turned = skew(np.where(since > 0, place - place[k] - speed[k] * since, 0.0))
+        by += [*(since * np.eye(3)[:, None]), *np.moveaxis(-turned, 2, 0)]
+        sigmas.append(np.repeat(kick, 3))
+    return Curve(place, np.stack(by, axis=-1), np.concatenate(sigmas), bias)
+
+
+def _kicks(windows: Sequence[Window], t: Floats, noise: ImuNoise) -> list[tuple[int, Floats]]:
+    """Windows at whose end velocity and attitude may change, with the sigmas of that: after every gap, and as often as
+    the noise in between is lumped together."""
+    kicks, since = [], 0.0
+    density = np.array([noise.accel_noise_density, noise.gyro_noise_density])
+    for k, window in enumerate(windows[:-1]):
+        if window.kind == "gap":
+            kicks.append((k, np.sqrt(window.length_s) * np.array([GAP_ACCEL, GAP_GYRO])))
+        elif t[k] - since >= KICK_S:
+            kicks.append((k, np.sqrt(t[k] - since) * density))
+            since = t[k]
+    return kicks
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Fixes (m, 3) at t (m,) s with one sigma m, the curve at each, and the mean (6,) of the biases."""
+
+    curve: Curve
+    fixes: Floats
+    t: Floats
+    sigma: float
+    gravity: float
+    bias_mean: Floats
+
+    def _off(self, state: Agreed) -> Floats:
+        """What was found of the curve (q,) beyond where it was integrated."""
+        return np.concatenate([state.found[:6] - self.curve.bias, state.found[6:]])
+
+    def residual(self, state: Agreed) -> tuple[Floats, Floats]:
+        """Whitened residuals (m, 3), and their derivatives (m, 3, 9 + q) by turn (nav), position, velocity, curve."""
+        turned = (self.curve.place + self.curve.by @ self._off(state)) @ state.R.T
+        line = state.p + state.v * self.t[:, None]
+        line[:, 2] -= 0.5 * self.gravity * self.t**2
+        by = np.zeros((len(self.t), 3, 9 + len(state.found)))
+        by[:, :, :3] = -skew(turned)
+        by[:, :, 3:6] = np.eye(3)
+        by[:, :, 6:9] = np.eye(3) * self.t[:, None, None]
+        by[:, :, 9:] = state.R @ self.curve.by
+        weight = 1.0 / np.hypot(self.sigma, UNTOLD)
+        return (line + turned - self.fixes) * weight, by * weight
+
+    def start(self, R: Floats, p: Floats, v: Floats) -> Agreed:
+        """A state of which the curve knows nothing yet."""
+        found = np.concatenate([self.bias_mean, np.zeros(len(self.curve.sigma) - 6)])
+        return self._judged(Agreed(R, p, v, found, self.t))
+
+    def _judged(self, state: Agreed) -> Agreed:
+        return replace(state, square=(self.residual(state)[0] ** 2).sum(axis=1))
+
+    def _prior(self, state: Agreed) -> Floats:
+        """Whitened distance (q,) of what was found from what was known."""
+        mean = np.concatenate([self.bias_mean, np.zeros(len(state.found) - 6)])
+        return np.asarray((state.found - mean) / self.curve.sigma)
+
+    def _cost(self, state: Agreed, weight: Floats) -> float:
+        return float(weight @ state.square + (self._prior(state) ** 2).sum())
+
+    def better(self, state: Agreed, weight: Floats) -> Agreed:
+        """One step down under row weights (m,), damped where Gauss-Newton goes too far."""
+        residual, by = self.residual(state)
+        root, q = np.sqrt(weight), len(state.found)
+        prior = np.hstack([np.zeros((q, 9)), np.diag(1.0 / self.curve.sigma)])
+        A = np.concatenate([(by * root[:, None, None]).reshape(-1, 9 + q), prior])
+        b = np.concatenate([(residual * root[:, None]).ravel(), self._prior(state)])
+        normal, gradient, before = A.T @ A, A.T @ b, self._cost(state, weight)
+        for damping in DAMPING:
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + LEAST_CURVATURE), gradient)
+            R = Rotation.from_rotvec(step[:3]).as_matrix() @ state.R
+            new = self._judged(Agreed(R, state.p + step[3:6], state.v + step[6:9], state.found + step[9:], self.t))
+            if self._cost(new, weight) <= before:
+                return new
+        return state
+
+    def thinned(self) -> Agreement:
+        """With at most so many fixes as tell where the path goes."""
+        rows = np.arange(0, len(self.t), -(-len(self.t) // MOST_FIXES))
+        return replace(self, curve=self.curve.at(rows), fixes=self.fixes[rows], t=self.t[rows])
+
+    def agree(self, R: Floats, p: Floats, v: Floats) -> Agreed:
+        """The state nearest to a start on which most fixes agree."""
+        found = _agree(self.thinned(), R, p, v)
+        return self._judged(found)
+
+
+def _agree(problem: Agreement, R: Floats, p: Floats, v: Floats) -> Agreed:
+    state, weight = problem.start(R, p, v), np.ones(len(problem.t))
+    for _ in range(FIRST_STEPS):
+        state = problem.better(state, weight)
+    mu = graduated.first_control(state.square, _limit())
+    for _ in range(STEPS):
+        weight = graduated.weights(state.square, _limit(), mu)
+        for _ in range(2):
+            state = problem.better(state, weight)
+        if np.isinf(mu) or (mu > 1.0 and graduated.settled(weight)):
+            break
+        mu *= GROWTH
+    return state
+
+
+def distinct(states: Sequence[Agreed]) -> list[Agreed]:
+    """The different ones of these states, cheapest first."""
+    chosen: list[Agreed] = []
+    for state in sorted(states, key=lambda s: s.cost):
+        alike = (
+            np.array_equal(state.outside, other.outside) and np.trace(state.R.T @ other.R) > 1 + 2 * np.cos(ALIKE)
+            for other in chosen
+        )
+        if not any(alike):
+            chosen.append(state)
+    return chosen
