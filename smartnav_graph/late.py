@@ -55,3 +55,9 @@ def _arranged(window: Window, late: Mapping[str, Sequence[LateRow]], masks: Mapp
     """One window without the rows that are not known at its end, with those that arrive in it."""
     rows = {name: found[~masks[name][found]] if name in masks else found for name, found in window.rows.items()}
     return replace(window, rows={name: found for name, found in rows.items() if len(found)}, late=late)
+
+
+def forget(windows: Sequence[Window], streams: Mapping[str, Stream], now_ns: int) -> list[Window]:
+    """The windows without the rows that were not known yet at `now_ns`."""
+    masks = {name: known_ns(stream) > now_ns for name, stream in streams.items()}
+    return [_arranged(window, {}, masks) for window in windows]

@@ -57,11 +57,12 @@ class FixedLag(Incremental):
         self._insert(step)
         graph = WholeGraph((f for _, f in self._factors), (b for _, b in self._blocks), self._held)
         order = self._order()
-        trust = np.concatenate([kind_of(name).trust for name in list(self._live.keys())])
+        names = list(self._live.keys())
+        trust = np.concatenate([kind_of(name).trust for name in names])
         for _ in range(MOST_STEPS):
             self._net = _eliminated(graph.linearize(self._live), order)
             delta = self._net.optimize()
-            _check(delta)
+            _check(delta, names)
             self._live = self._live.retract(delta)
             if (np.abs(delta.vector()) < SETTLED * self.config.relinearize * trust).all():
                 break
@@ -179,8 +180,8 @@ def _parted(block: Block) -> list[tuple[int, Block]]:
     return [(index, _only(block, [o == index for o in oldest])) for index in dict.fromkeys(oldest) if index is not None]
 
 
-def _check(delta: Any) -> None:
+def _check(delta: Any, names: Sequence[int]) -> None:
     """Refuse a step that is no number: a state is not determined."""
     if not np.isfinite(delta.vector()).all():
-        names = [name for name in list(delta.keys()) if not np.isfinite(delta.at(name)).all()]
-        raise RuntimeError(f"(Symbol: {gtsam.Symbol(names[0]).string()})")
+        bad = next(name for name in names if not np.isfinite(delta.at(name)).all())
+        raise RuntimeError(f"(Symbol: {gtsam.Symbol(bad).string()})")
