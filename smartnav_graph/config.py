@@ -29,6 +29,7 @@ from smartnav_graph.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
+from smartnav_graph.standstill import StandstillConfig
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ class Config:
     imu: ImuConfig = field(default_factory=ImuConfig)
     gnss: GnssConfig = field(default_factory=GnssConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    standstill: StandstillConfig = field(default_factory=StandstillConfig)
     magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
     gravity: GravityConfig = field(default_factory=GravityConfig)
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)

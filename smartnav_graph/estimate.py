@@ -188,6 +188,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         forward=session.device.forward,
         config=config,
         weak=problem.config.prior,
+        standstill=problem.rests_at_start,
         **_north(problem),
     )
     return initialiser.run(solve, given)

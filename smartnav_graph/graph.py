@@ -54,6 +54,7 @@ STATES: dict[str, StateKind] = {
         _kind("W", "wheel scale and delay", "session", [0.1, 0.3], [0.005, 0.01]),
         _kind("H", "hard iron", "session", [100.0] * 3, [1.0] * 3),
         _kind("F", "magnetic field strength", "session", [30.0] * 2, [1.0] * 2),
+        _kind("U", "floor height", "session", [1.0], [0.1]),
         _kind("K", "step factor", "session", [0.3] * 2, [0.02] * 2),
         _kind("S", "inertial scale and misalignment", "session", [0.03] * 18, [0.003] * 18),
     )
@@ -62,7 +63,7 @@ KEYFRAME_LETTERS = tuple(kind.letter for kind in STATES.values() if kind.scope =
 # A session state's index is its sensor's place here.
 SENSORS = (
     *("imu", "gnss", "control", "pose_fixes", "velocity", "wheel", "vehicle", "magnetometer", "barometer", "steps"),
-    *("images", "tracks", "matches"),
+    *("images", "tracks", "matches", "static"),
 )
 
 

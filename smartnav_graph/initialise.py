@@ -134,7 +134,7 @@ class Initialiser:
     """Everything `run` needs.
 
     fixes : absolute positions as (t_ns (m,), nav_p (m, 3)), in time order; fix_sigma : their typical sigma, m
-    sources : sensor and row of each fix
+    sources : sensor and row of each fix; arrival_ns (m,) : when each became known, where that is later
     standstill : factors of their own say that a rest at the start does not move and does not turn
     iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
     field_start : where north is by the first seconds, where they tell
@@ -156,6 +156,7 @@ class Initialiser:
     magnetic_stage: int | None = None
     field_start: FieldStart | None = None
     sources: Sequence[tuple[str, int]] = ()
+    arrival_ns: NDArray[np.int64] | None = None
 
     def run(self, solve: Solve, given: Given | None) -> Initial:
         """The first state.
@@ -226,6 +227,8 @@ class Initialiser:
         velocity = np.full(3, self.weak.speed_sigma)
         if rest is not None:
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
+        held = rest is not None and not self.standstill
+        if rest is not None and held:
             bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
             velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
@@ -236,7 +239,7 @@ class Initialiser:
             sigma_bias=bias,
             velocity_mean=np.zeros(3),
             bias_mean=mean,
-            rest_end_ns=None if rest is None else self.windows[0].t1_ns + int(rest.length_s * NS),
+            rest_end_ns=self.windows[0].t1_ns + int(rest.length_s * NS) if rest is not None and held else None,
         )
         magnetic = self._magnetic_heading(rest)
         if rest is not None and magnetic is not None:
@@ -298,9 +301,9 @@ class Initialiser:
         """Refine the start on which most fixes of the first stretch agree; others where it fits badly; a longer stretch
         while the heading stays open."""
         stretch, tried = self.config.stretch_s, 0
+        before: list[State] = []
         while True:
             count = self._count(stretch)
-        before: list[State] = []
             last = stretch >= self.config.max_stretch_s or count >= len(self.windows)
             results: list[tuple[float, Initial]] = []
             for state, memory in self._candidates(count, rest, before):
@@ -313,9 +316,9 @@ class Initialiser:
                 best = min(results, key=lambda item: item[0])[1]
                 if last or self._sure(best):
                     return replace(best, starts=tried)
+                before = [best.prior.start]
             elif last:
                 raise SolverError(
-                before = [best.prior.start]
                     "initialisation",
                     f"no start converges on the first {count} keyframes",
                     "inertial data and fixes of the same motion",
@@ -346,13 +349,16 @@ class Initialiser:
         ends = np.array([w.t1_ns for w in self.windows])
         return int(np.searchsorted(ends, begin + int(stretch_s * NS), side="right"))
 
-    def _starts(self, count: int, rest: Rest | None) -> list[State]:
-        """First states to try: the inertial curve laid on the fixes, then headings all round."""
+    def _known(self, now_ns: int) -> NDArray[np.bool_]:
+        """Mask of the fixes that speak of, and were known by, this time."""
+        known = self.fixes[0] if self.arrival_ns is None else self.arrival_ns
+        return np.asarray((self.fixes[0] <= now_ns) & (known <= now_ns))
+
     def _candidates(self, count: int, rest: Rest | None, before: Sequence[State]) -> list[tuple[State, Memory]]:
         """First states to try, those that most fixes agree on first, with the rows that do not."""
         windows = self.windows[:count]
         ends = np.array([w.t1_ns for w in windows])
-        used = self.fixes[0] <= ends[-1]
+        used = self._known(int(ends[-1]))
         t_ns, fixes = (column[used] for column in self.fixes)
         starts = [*before, *self._starts(count, rest)]
         mean, sigma = np.zeros(6), np.array([self.noise.accel_bias_sigma] * 3 + [self.noise.gyro_bias_sigma] * 3)
@@ -383,10 +389,12 @@ class Initialiser:
             rejected.setdefault(name, set()).add(row)
         return Memory(phase="gated", rejected={name: frozenset(rows) for name, rows in rejected.items()})
 
+    def _starts(self, count: int, rest: Rest | None) -> list[State]:
+        """First states to try: the inertial curve laid on the fixes, then headings all round."""
         windows = self.windows[:count]
         magnetic = self._magnetic_heading(rest)
         t_ns, fixes = self.fixes
-        used = t_ns <= windows[-1].t1_ns
+        used = self._known(windows[-1].t1_ns)
         t_ns, fixes = t_ns[used], fixes[used]
         bias = gtsam.imuBias.ConstantBias() if rest is None else gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
         ends = np.array([w.t1_ns for w in windows])
@@ -438,4 +446,6 @@ class Initialiser:
             f"Heading {heading:.1f} deg +- {min(sigma, 180.0):.1f} deg found from {source} of the first "
             f"{stretch:.0f} s; {vertical}."
         )
+        if _rejections(memory):
+            memory = replace(memory, phase="robust")  # there will be more of them
         return Initial(self._prior(state, rest), method, sentence, heading, min(sigma, 180.0), stretch, 1, memory)

@@ -18,6 +18,7 @@ from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import NS, Gap, interpolate, ns_from_seconds
 
 Times = NDArray[np.int64]
+NOWHERE: Times = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -39,11 +40,16 @@ class KeyframeConfig:
 
 
 def keyframe_times(
-    span_ns: tuple[int, int], aiding: Sequence[Times], gaps: Sequence[Gap], config: KeyframeConfig
+    span_ns: tuple[int, int],
+    aiding: Sequence[Times],
+    gaps: Sequence[Gap],
+    config: KeyframeConfig,
+    standstills: Times = NOWHERE,
 ) -> Times:
     """Strictly increasing keyframe stamps (n,) from span_ns[0] to span_ns[1].
 
     Aiding epochs win over everything they stand closer to than `merge_s`; inside a gap only aiding adds keyframes.
+    `standstills` are the stamps that standstills ask for: their borders, and what lies between.
     """
     start, end = span_ns
     merge = int(config.merge_s * NS)
@@ -51,7 +57,7 @@ def keyframe_times(
     aided = np.unique(np.concatenate([np.zeros(0, np.int64), *aiding]))
     aided = aided[(aided >= start) & (aided <= end)]
     aided = aided[np.concatenate([[True], np.diff(aided) > merge])] if len(aided) else aided
-    rest = np.unique(np.array([start, end, *borders], dtype=np.int64))
+    rest = np.unique(np.concatenate([np.array([start, end, *borders], dtype=np.int64), standstills]))
     rest = rest[(rest >= start) & (rest <= end)]
     if len(aided):
         right = np.clip(np.searchsorted(aided, rest), 1, len(aided)) - 1
@@ -88,6 +94,7 @@ def make_windows(
     gaps: Sequence[Gap],
     aiding: Mapping[str, Times],
     config: KeyframeConfig,
+    standstills: Sequence[tuple[int, int]] = (),
 ) -> list[Window]:
     """One window a keyframe; the first has no length.
 
@@ -95,6 +102,7 @@ def make_windows(
     ----------
     times : (n,) keyframe stamps inside the inertial span
     gaps : stretches whose windows are of kind ``gap``
+    standstills : first and last stamp of each; windows wholly inside one are of kind ``static``
     aiding : stamps of every aiding stream; each row goes to the keyframe it shares its epoch with
     """
     grid = np.sort(np.concatenate([imu.t_ns[(imu.t_ns > times[0]) & (imu.t_ns < times[-1])], times]), kind="stable")
@@ -105,19 +113,36 @@ def make_windows(
     # Preintegration turns the force by the attitude at the interval's start; half the turn of the interval is missing.
     means[:, :3] += 0.5 * dt[:, None] * np.cross(means[:, 3:], means[:, :3])
     cut = np.searchsorted(grid, times)
-    in_gap = inside(gaps, times[:-1] + np.diff(times) // 2)
+    kinds = _kinds(times, gaps, standstills)
     rows = _rows_by_keyframe(times, aiding, int(config.merge_s * NS))
 
     windows = [Window(0, int(times[0]), int(times[0]), "first", dt[:0], means[:0, :3], means[:0, 3:], rows.get(0, {}))]
     for k in range(1, len(times)):
         part = slice(cut[k - 1], cut[k])
-        kind = "gap" if in_gap[k - 1] else "normal"
         windows.append(
             Window(
-                k, int(times[k - 1]), int(times[k]), kind, dt[part], means[part, :3], means[part, 3:], rows.get(k, {})
+                k,
+                int(times[k - 1]),
+                int(times[k]),
+                kinds[k - 1],
+                dt[part],
+                means[part, :3],
+                means[part, 3:],
+                rows.get(k, {}),
             )
         )
     return windows
+
+
+def _kinds(times: Times, gaps: Sequence[Gap], standstills: Sequence[tuple[int, int]]) -> list[str]:
+    """Kind of the window that ends at each keyframe but the first."""
+    kinds = np.full(len(times) - 1, "normal", dtype=object)
+    if standstills:
+        start, end = np.array(standstills, dtype=np.int64).T
+        at = np.searchsorted(start, times[:-1], side="right") - 1
+        kinds[(at >= 0) & (times[1:] <= end[at])] = "static"
+    kinds[inside(gaps, times[:-1] + np.diff(times) // 2)] = "gap"
+    return list(kinds)
 
 
 def _rows_by_keyframe(

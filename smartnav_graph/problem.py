@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder, Window
 from smartnav_graph.keyframes import keyframe_times, make_windows
 from smartnav_graph.session import Session
+from smartnav_graph.standstill import Standstills, find_standstills
 from smartnav_graph.streams import Positioned
 from smartnav_graph.timebase import NS, Gap, find_gaps
 from smartnav_graph.withhold import split
@@ -35,10 +36,23 @@ class Problem:
     withheld: Mapping[str, Positioned]
     dropped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     warnings: Sequence[str] = ()
+    rests: Standstills | None = None
 
     @property
     def vehicle(self) -> str:
         return self.config.run.vehicle or self.session.device.vehicle
+
+    @property
+    def rests_at_start(self) -> bool:
+        """Whether the first keyframe lies in a true rest that standstill factors speak for."""
+        options, rests = self.config.standstill, self.rests
+        at = self.windows[0].t1_ns
+        return (
+            rests is not None
+            and options.zupt
+            and options.zaru
+            and bool(np.isfinite(rests.over(rests.turn_sigma, at, at)))
+        )
 
 
 def prepare(session: Session, config: Config) -> Problem:
@@ -73,16 +87,22 @@ def prepare(session: Session, config: Config) -> Problem:
     aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
     span, told = _trimmed(asked, aiding, config.keyframes.lead_s, session.t0_ns)
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
-    times = keyframe_times(span, list(aiding.values()), gaps, config.keyframes)
-    windows = make_windows(imu, times, gaps, aiding, config.keyframes)
     calibration = session.calibration or Calibration()
     vehicle = config.run.vehicle or session.device.vehicle
-    context = FactorContext(session, calibration, gaps, vehicle, config)
+    noise, still = calibration.imu_noise, config.standstill
+    rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still)
+    spacing = config.keyframes
+    if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
+        spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, still.swing_s))
+    standing = rests.keyframes(still.stance_s if rests.on_foot else None)
+    times = keyframe_times(span, list(aiding.values()), gaps, spacing, standing)
+    windows = make_windows(imu, times, gaps, aiding, spacing, rests.spans())
+    context = FactorContext(session, calibration, gaps, vehicle, config, rests)
     builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
     warnings = [*warnings, *told, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
-    return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings)
+    return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests)
 
 
 def _choose_sensors(session: Session, chosen: Sequence[str]) -> Session:

@@ -46,11 +46,11 @@ BLOCK_S = 0.1
 # means (rad/s, m/s^2): wheels on the smoothest road turn a device by more, and a hand or a walking foot by far.
 REST_BLOCKS, REST_MARGIN, REST_RATE, REST_FORCE = 10, 2, 3e-3, 0.05
 # A foot's rest is told from its walking by orders of magnitude; who stands on it shifts his weight.
-FOOT_BLOCKS, FOOT_MARGIN, FOOT_RATE = 5, 1, 8e-3
+FOOT_BLOCKS, FOOT_MARGIN, FOOT_RATE = 7, 1, 12e-3
 # Factor on the noise of block means that the scatter of a window at rest stays below.
 NOISE_FACTOR = 1.35
-# Specific force at rest is gravity, but for the accelerometer's bias: m/s^2.
-FORCE_ERROR = 1.0
+# Specific force at rest is gravity, but for the accelerometer's bias (m/s^2); rate is bias, so many sigmas at most.
+FORCE_ERROR, BIAS_SIGMAS = 1.0, 4.0
 REST_SPEED = 0.01  # m/s
 # Turn of a device at rest between two keyframes, rad: at least, and as the time over which its scatter acts.
 LEAST_TURN, TURN_TIME = 2e-4, 0.1
@@ -64,7 +64,7 @@ ABOVE, LOWEST, HIGHEST = 1.3, 4.2, 6.6
 SHORTEST_S = 0.03
 ARM = 0.03  # m from the point the foot turns about to the sensor
 # A foot swings faster (rad/s) and is set down harder (m/s^2 beside gravity) than what is carried; it stands in between.
-SWING_RATE, IMPACT, STAND_RATE, STAND_FORCE, STRIDE_S, STAND_SHARE = 4.0, 15.0, 0.5, 1.5, 1.5, 0.1
+SWING_RATE, IMPACT, STAND_RATE, STAND_FORCE, STRIDE_S, STAND_SHARE = 4.0, 15.0, 1.0, 2.0, 1.5, 0.08
 
 
 @dataclass(frozen=True)
@@ -286,6 +286,7 @@ def _rests(blocks: _Blocks, t_ns: Times, noise: ImuNoise, gravity: float, on_foo
     slow = max(FOOT_RATE if on_foot else REST_RATE, per_block * noise.gyro_noise_density)
     soft = max(REST_FORCE, per_block * noise.accel_noise_density)
     level = np.abs(np.linalg.norm(force.mean(axis=-1), axis=1) - gravity) < FORCE_ERROR
+    level &= np.abs(rate.mean(axis=-1)).max(axis=1) < BIAS_SIGMAS * noise.gyro_bias_sigma
     whole = sliding_window_view(blocks.whole, width).all(axis=1)
     quiet = whole & (turning < slow) & (shaking < soft) & level
     scatter = _spread(np.where(quiet, turning, np.inf), width, margin)

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from smartnav_graph.factors import barometer, control, gnss, gravity, imu, magnetometer, step, vehicle, velocity, wheel
+from smartnav_graph.factors import (
+    barometer,
+    control,
+    gnss,
+    gravity,
+    imu,
+    magnetometer,
+    standstill,
+    step,
+    vehicle,
+    velocity,
+    wheel,
+)
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Builder
 
@@ -13,6 +25,7 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "imu": imu.build,
     "gnss": gnss.build,
     "control": control.build,
+    "static": standstill.build,
     "gnss_velocity": velocity.build_gnss,
     "velocity": velocity.build,
     "vehicle": vehicle.build,

@@ -8,16 +8,24 @@ from typing import Any
 
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.session import Session
+from smartnav_graph.standstill import Standstills
 from smartnav_graph.timebase import Gap
 
 
 @dataclass(frozen=True)
 class FactorContext:
     """The session without its withheld rows, the device's calibration, holes of the inertial data, what carries the
-    device (none, car, trolley, foot), and the options of all rooms (`config.Config`, which stands below this room)."""
+    device (none, car, trolley, foot), the options of all rooms (`config.Config`, which stands below this room), and the
+    standstills of the recording."""
 
     session: Session
     calibration: Calibration
     gaps: Sequence[Gap]
     vehicle: str
     config: Any
+    rests: Standstills | None = None
+
+    @property
+    def on_foot(self) -> bool:
+        """Whether the device is mounted on a walking foot: its stances hold speed and tilt."""
+        return self.rests is not None and self.rests.on_foot

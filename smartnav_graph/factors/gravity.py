@@ -160,7 +160,7 @@ BIAS_SLACK = 0.2
 def build(context: FactorContext) -> GravityBuilder | None:
     """The tilt of whoever has nothing else."""
     config = context.config.gravity
-    if config.enabled == "off" or (config.enabled == "auto" and context.vehicle in WHEELED):
+    if config.enabled == "off" or (config.enabled == "auto" and (context.vehicle in WHEELED or context.on_foot)):
         return None
     stamps = [stream.t_ns for name, stream in context.session.streams().items() if name in HOLDS_TILT]
     held_ns = np.sort(np.concatenate([np.zeros(0, np.int64), *stamps]))

@@ -159,7 +159,7 @@ class StepBuilder:
 def build(context: FactorContext) -> StepBuilder | None:
     """The builder of a walker's steps."""
     config, session = context.config.steps, context.session
-    if config.enabled == "off" or (config.enabled == "auto" and context.vehicle != "foot"):
+    if config.enabled == "off" or (config.enabled == "auto" and (context.vehicle != "foot" or context.on_foot)):
         return None
     streams = (session.gnss, session.control, session.pose_fixes)
     times = [stream.t_ns for stream in streams if stream is not None]

@@ -1,0 +1,111 @@
+"""Zero velocity at standstills, no turn where the device is truly at rest, one level under all stances of a foot.
+
+    velocity    nav_v_body = 0                                  sigma from the detector, metres a second
+    turn        nav_R_body(t1) = nav_R_body(t0)                 over windows wholly at rest
+    level       u(t) - U = 0                                    stances of a foot-mounted IMU on a declared flat floor
+
+The second is what is called a zero angular rate update: with the inertial factor beside it the gyro's mean reading is
+its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias would let wander.
+A standstill that is none must not bend the trajectory: beyond `TAIL` sigmas a row pulls with constant force only.
+
+Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, IEEE CG&A 25(6); Skog et al. (2010).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Tag, Window, key
+from smartnav_graph.standstill import StandstillConfig, Standstills
+
+Floats = NDArray[np.float64]
+
+TAIL = 4.0
+# The pair of attitudes leaves the positions alone: m.
+ANYWHERE = 10.0
+# Prior sigma (m) of the floor's height.
+UNKNOWN_LEVEL = 1000.0
+
+
+class Level:
+    """Data: sigma (1) m. Residual (m, 1): height above the floor state U."""
+
+    extra: tuple[str, ...] = ("U",)
+    width = 1
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        (floor,) = extra
+        weight = 1.0 / data[:, :1]
+        by_state = np.zeros((len(p), 1, 9))
+        by_state[:, 0, 5] = weight[:, 0]
+        return (p[:, 2:] - floor) * weight, by_state, [-weight[:, :, None]]
+
+
+MODEL = AtKeyframe(Level())
+
+
+@dataclass
+class StandstillBuilder:
+    """Adds what a standstill says at each keyframe inside one.
+
+    rests : the standstills of the recording; _floor : the floor's state, once a stance has been seen
+    """
+
+    rests: Standstills
+    config: StandstillConfig = field(default_factory=StandstillConfig)
+    name: str = "static"
+    stage: int = 0
+    _floor: SessionState | None = None
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """Factors at the keyframe that ends `window`."""
+        speed = self.rests.speed_at(window.t1_ns)
+        if np.isfinite(speed):
+            if self.config.zupt:
+                self._add_speed(step, speed)
+            if self.config.flat_floor and self.rests.on_foot:
+                self._add_level(step)
+        if self.config.zaru and previous is not None and window.kind != "gap":
+            turn = self.rests.over(self.rests.turn_sigma, window.t0_ns, window.t1_ns)
+            if np.isfinite(turn):
+                self._add_turn(step, turn)
+
+    def _add_speed(self, step: Step, sigma: float) -> None:
+        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), _tailed(np.full(3, sigma)))
+        step.add(Tag(self.name, step.t_ns), zero)
+
+    def _add_turn(self, step: Step, sigma: float) -> None:
+        before, here = key("X", step.index - 1), key("X", step.index)
+        model = _tailed(np.array([sigma] * 3 + [ANYWHERE] * 3))
+        step.add(Tag("static_turn", step.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
+
+    def _add_level(self, step: Step) -> None:
+        if self._floor is None:
+            height = np.array([step.predicted.position()[2]])
+            self._floor = SessionState("U", self.name, "floor_height_m", height, np.array([UNKNOWN_LEVEL]))
+        keys = (key("X", step.index), key("V", step.index), step.use(self._floor))
+        data = np.array([[self.config.floor_sigma]])
+        step.blocks.append(Block("static_level", MODEL, [keys], data, step.t_ns, loss="huber"))
+
+
+def _tailed(sigmas: Floats) -> gtsam.noiseModel.Base:
+    """Diagonal noise with a loss that grows linearly beyond `TAIL`."""
+    robust = gtsam.noiseModel.mEstimator.Huber.Create(TAIL)
+    return gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def build(context: FactorContext) -> StandstillBuilder | None:
+    """The builder, where a session stands still at all."""
+    if context.rests is None or not context.rests.still.any():
+        return None
+    return StandstillBuilder(context.rests, context.config.standstill)

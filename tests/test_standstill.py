@@ -1,0 +1,224 @@
+"""Standstills: rests between motions, stances of a synthetic foot, listed periods, and what is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smartnav_graph import readers
+from smartnav_graph.calibration.model import DEVICE_CLASSES
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.simulation import motions
+from smartnav_graph.simulation.scenarios import simulate
+from smartnav_graph.simulation.sensors import PROFILES, imu
+from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
+from smartnav_graph.standstill import (
+    LOOKAHEAD_S,
+    REST_SPEED,
+    StandstillConfig,
+    Standstills,
+    find_standstills,
+    runs,
+    stance_speed,
+)
+from smartnav_graph.streams import Imu, StaticPeriod
+from smartnav_graph.timebase import NS, Gap, find_gaps
+
+GRAVITY = 9.81
+PHONE = PROFILES["galaxy-s2"].noise
+
+
+def ride(trajectory, noise=PHONE, seed=0, hertz=100.0):
+    """Inertial samples along a motion."""
+    t = np.arange(0.0, trajectory.duration, 1.0 / hertz)
+    t_ns = np.rint(t * NS).astype(np.int64)
+    return imu(trajectory.sample(t), t_ns, noise, GRAVITY, np.random.default_rng(seed))[0]
+
+
+def found(samples, vehicle="none", listed=None, gaps=(), noise=PHONE, **options):
+    return find_standstills(samples, listed, gaps, vehicle, noise, GRAVITY, StandstillConfig(**options))
+
+
+def seconds(spans):
+    return [(start / NS, end / NS) for start, end in spans]
+
+
+def stop_and_go(sway=()):
+    """5 s rest, 20 s drive, 6 s stop, 20 s drive."""
+    legs = [Leg(5.0, 0.0), Leg(4.0, 8.0), Leg(12.0, 8.0, 40.0), Leg(4.0, 0.0), Leg(6.0, 0.0), Leg(4.0, 8.0)]
+    return Trajectory(Legs([*legs, Leg(12.0, 8.0, -30.0), Leg(4.0, 0.0)]), sway=sway, sway_speed=8.0)
+
+
+def test_the_rests_of_a_drive_and_nothing_else():
+    samples = ride(stop_and_go(motions._SPRINGS))
+    rests = found(samples, "car")
+    (first, stop) = seconds(rests.rests())[:2]
+    assert first[0] == 0.0 and 4.5 < first[1] < 5.2
+    assert 24.9 < stop[0] < 25.7 and 30.5 < stop[1] < 31.2
+    assert rests.spans() == rests.rests() and not rests.on_foot
+    # a rest found is sure to a centimetre a second; elsewhere nothing is known
+    assert rests.speed_at(3 * NS) == REST_SPEED and np.isnan(rests.speed_at(10 * NS))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("scenario", ["phone-car-5min", "trolley-loop"])
+def test_no_false_rest_on_wheels(scenario, seed):
+    session = simulate(scenario, seed)
+    noise = session.calibration.imu_noise
+    rests = find_standstills(session.imu, None, (), session.device.vehicle, noise, GRAVITY, StandstillConfig())
+    at = session.reference.t_ns
+    speed = np.linalg.norm(session.reference.velocity, axis=1)
+    still = np.array([np.isfinite(rests.speed_at(int(t))) for t in at])
+    assert speed[still].max(initial=0.0) < 0.1  # m/s: a wheel that begins to roll
+    listed = session.static
+    rest = [start for start, end in zip(listed.t_ns, listed.t_end_ns, strict=True) if end - start > 3 * NS]
+    assert len(rest) > 0 and all(any(a - 2 * NS < r < b for a, b in rests.spans()) for r in rest)
+
+
+def test_steady_travel_on_real_roads_is_no_rest(dataset, kitti):
+    noise = DEVICE_CLASSES["mems"]
+    motorway = readers.read(dataset("car_comma2k19"))
+    assert not found(motorway.imu, noise=noise).still.any()  # never below 8 m/s
+    gaps = find_gaps(kitti.imu.t_ns, np.hstack([kitti.imu.gyro, kitti.imu.accel]))
+    rests = found(kitti.imu, gaps=gaps, noise=noise)
+    fixes = kitti.nav_position(kitti.gnss)
+    speed = np.linalg.norm(np.diff(fixes, axis=0), axis=1) / (np.diff(kitti.gnss.t_ns) / NS)
+    for start, end in rests.spans():
+        assert np.interp([start, end], kitti.gnss.t_ns[1:], speed).max() < 1.0
+
+
+def test_gaps_are_no_rest():
+    samples = ride(motions.static(20.0))
+    rests = found(samples, gaps=[Gap(5 * NS, 7 * NS, "bridged")])
+    assert seconds(rests.spans()) == [(0.0, pytest.approx(4.9, abs=0.4)), (pytest.approx(7.1, abs=0.4), 19.99)]
+
+
+def test_a_rest_holds_no_turn_only_where_the_data_say_so():
+    # a listed stop during which the device is handled: no velocity, but turns
+    trajectory = motions.figure_eight(20.0)
+    listed = StaticPeriod(t_ns=[8 * NS], t_end_ns=[10 * NS], sigma_v=[0.05])
+    rests = found(ride(trajectory), listed=listed)
+    assert rests.speed_at(9 * NS) == 0.05 and np.isnan(rests.over(rests.turn_sigma, 8 * NS, 10 * NS))
+    assert np.isfinite(rests.over(rests.turn_sigma, NS, 3 * NS))  # the rest before
+    only = found(ride(trajectory), listed=listed, detect=False)
+    assert seconds(only.spans()) == [(8.0, 10.0)] and not only.rests()
+    assert not find_standstills(
+        ride(trajectory), listed, (), "none", PHONE, GRAVITY, StandstillConfig(listed=False, detect=False)
+    ).still.any()
+
+
+def foot(strides=30, stance=0.5, swing=0.6, hertz=200.0, seed=1, rolling=0.0):
+    """A foot that stands and swings in turn: (samples, mask of the stances). Gravity on z; 3 s of rest first."""
+    rng = np.random.default_rng(seed)
+    part = np.concatenate(
+        [np.zeros(round(3 * hertz)), np.tile([0.0] * round(stance * hertz) + [1.0] * round(swing * hertz), strides)]
+    )
+    n, dt = len(part), 1.0 / hertz
+    phase = np.zeros(n)
+    for first, last in runs(part > 0):
+        phase[first:last] = np.linspace(0.0, 2 * np.pi, last - first)
+    rate = np.zeros((n, 3))
+    rate[:, 1] = 7.0 * np.sin(phase) + rolling * (part == 0)
+    force = np.tile([0.0, 0.0, GRAVITY], (n, 1))
+    force[:, 0] += 20.0 * np.sin(phase)
+    force[:, 2] += 15.0 * np.sin(2 * phase)
+    rate, force = rate + rng.normal(0, 0.005, (n, 3)), force + rng.normal(0, 0.03, (n, 3))
+    return Imu(t_ns=np.rint(np.arange(n) * dt * NS).astype(np.int64), gyro=rate, accel=force), part == 0
+
+
+# the force hardly changes at its own extremes, which a variance takes for rest
+@pytest.mark.parametrize(("detector", "false"), [("shoe", 0.06), ("are", 0.06), ("amv", 0.3)])
+def test_the_stances_of_a_foot(detector, false):
+    samples, stands = foot()
+    rests = found(samples, "foot", detector=detector)
+    assert rests.on_foot
+    # stances are found but for the samples at their ends, and hardly anything of the swing is taken for one
+    assert rests.still[stands].mean() > 0.85
+    assert rests.still[~stands].mean() < false
+    assert detector == "amv" or len(rests.spans()) in (30, 31)  # the recording ends with a swing
+    # truly at rest before the first step and in pauses, not in each stance
+    assert seconds(rests.rests())[0][0] == 0.0 and len(rests.rests()) < 3
+
+
+def test_a_rolling_foot_is_less_sure():
+    slow, fast = (np.nanmedian(stance_speed(foot(rolling=rate)[0], GRAVITY)[700:]) for rate in (0.3, 1.2))
+    # 3 cm from the point the foot turns about
+    assert slow == pytest.approx(0.03 * 0.3, rel=0.3, abs=0.002) and fast == pytest.approx(0.03 * 1.2, rel=0.3)
+
+
+def test_who_walks_with_a_phone_in_the_hand_is_not_on_foot():
+    session = simulate("walk-60s", 0)
+    rests = find_standstills(session.imu, None, (), "foot", PHONE, GRAVITY, StandstillConfig())
+    assert not rests.on_foot
+    declared = find_standstills(session.imu, None, (), "foot", PHONE, GRAVITY, StandstillConfig(mounting="foot"))
+    assert declared.on_foot
+
+
+@pytest.mark.parametrize("vehicle", ["car", "trolley"])
+def test_wheels_are_no_feet(vehicle):
+    assert not found(foot()[0], vehicle).on_foot
+
+
+def test_real_feet_and_hands_are_told_apart(dataset):
+    def on_foot(source):
+        session = readers.read(source)
+        return find_standstills(
+            session.imu, None, (), "foot", DEVICE_CLASSES["mems"], session.gravity, StandstillConfig()
+        ).on_foot
+
+    walks = sorted(dataset("foot_pyshoe_vicon").glob("*.mat"))
+    assert len(walks) >= 4 and all(on_foot(walk) for walk in walks)
+    assert all(on_foot(f"{dataset('foot_dual_zupt')}#{foot}") for foot in ("left", "right"))
+    phones = ("android/Jakob_Nexus5_NoDist_Texting", "ios/Guillaume_iPhone5_NoDist_Texting")
+    assert not any(on_foot(dataset("phone_mocap_tyrex") / phone) for phone in phones)
+
+
+@pytest.mark.parametrize("made", ["wheels", "foot"])
+def test_nothing_rests_on_what_comes_later_than_the_lookahead(made):
+    samples, vehicle = (ride(stop_and_go()), "car") if made == "wheels" else (foot()[0], "foot")
+    options = {"mounting": "foot"} if made == "foot" else {}
+    whole = found(samples, vehicle, **options)
+    for cut_s in (4.6, 8.3, 26.4, 30.9):
+        shorter = samples.take(samples.t_ns <= round(cut_s * NS))
+        part = found(shorter, vehicle, **options)
+        known = shorter.t_ns <= round((cut_s - LOOKAHEAD_S) * NS)
+        for name in ("speed_sigma", "turn_sigma"):
+            now, then = getattr(whole, name)[: len(known)][known], getattr(part, name)[known]
+            np.testing.assert_allclose(now, then, rtol=1e-9)
+
+
+def test_stamps_of_keyframes():
+    t_ns = np.arange(11) * NS
+    speed = np.array([np.nan, 1, 1, 1, np.nan, np.nan, 1, np.nan, np.nan, np.nan, 1])
+    rests = Standstills(t_ns, speed, speed)
+    assert seconds(rests.spans()) == [(1, 3), (6, 6), (10, 10)]
+    assert (rests.keyframes() / NS).tolist() == [1, 3, 6, 10]
+    assert (rests.keyframes(0.9) / NS).tolist() == pytest.approx([1, 1 + 2 / 3, 1 + 4 / 3, 3, 6, 10])
+    # between two samples both must stand still
+    assert rests.speed_at(round(1.5 * NS)) == 1 and np.isnan(rests.speed_at(round(3.5 * NS)))
+    assert rests.over(speed, NS, 3 * NS) == 1 and np.isnan(rests.over(speed, NS, 4 * NS))
+    assert np.isnan(rests.speed_at(-NS)) and rests.speed_at(10 * NS) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"detector": "zvd"}, "detector = 'zvd'; expected one of shoe, are, amv"),
+        ({"mounting": "hand"}, "mounting = 'hand'; expected one of auto, foot, body"),
+        ({"floor_sigma": 0.0}, "floor_sigma, stance_s or swing_s <= 0; expected > 0"),
+    ],
+)
+def test_wrong_options(options, told):
+    with pytest.raises(ConfigError, match=told):
+        StandstillConfig(**options)
+
+
+def test_too_short_and_odd_recordings():
+    for n in (2, 3, 30):
+        samples = ride(motions.static(10.0)).take(slice(0, n))
+        assert not found(samples).still.any()
+    slow = ride(motions.static(60.0), hertz=5.0)  # a tenth of a second without a sample tells nothing
+    assert not found(slow).still.any()
+    assert found(ride(motions.static(60.0), hertz=10.0)).still.all()
+    upside = replace(samples := ride(motions.static(10.0)), accel=1.2 * samples.accel)
+    assert not found(upside).still.any()  # 20 % more than gravity is no rest
