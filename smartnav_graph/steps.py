@@ -26,9 +26,10 @@ RATE_HZ = 50.0
 CUTOFF_HZ = 3.0  # people make 1.4 to 2.5 steps a second
 HALF_S = 0.2  # half length of the low-pass filter
 MEAN_S = 2.0  # the mean of so many seconds before is taken off
-RISE = 0.3  # m/s^2 above the mean that ends a step, after as much below it
-LEAST_SWING = 1.5  # m/s^2 from the least to the largest: a slow step swings by 2, a hand that stands by 1
+RISE = 0.2  # m/s^2 above the mean that ends a step, after as much below it
+LEAST_SWING = 0.75  # m/s^2 from the least to the largest: someone who writes while walking slowly swings by 1
 SHORTEST_S, LONGEST_S = 0.25, 0.75  # what comes before the longest step, or the first after a rest, was no walking
+LONGEST_PERIOD_S, RUN, RATIO = 1.0, 6, 0.25  # of a regular walk: seconds a step, steps in a row, change of period
 LOOKAHEAD_S = HALF_S + 1.0 / RATE_HZ + LONGEST_S
 
 
@@ -101,3 +102,15 @@ def _rises(force: Floats) -> NDArray[np.intp]:
             if not found or k - found[-1] >= SHORTEST_S * RATE_HZ:
                 found.append(k)
     return np.array(found, dtype=np.intp)
+
+
+def regular_share(steps: Steps, length_s: float) -> float:
+    """Share of `length_s` seconds spent in runs of at least `RUN` steps whose periods hardly differ: near one for a
+    device in the hand of a walker, near zero in a vehicle or on a foot."""
+    period = np.diff(steps.end_ns) / NS
+    usual = period <= LONGEST_PERIOD_S
+    alike = np.abs(np.diff(np.log(period))) < np.log(1.0 + RATIO) if len(period) else np.zeros(0, dtype=bool)
+    joined = np.concatenate([[False], usual[1:] & usual[:-1] & alike, [False]])
+    starts, ends = np.flatnonzero(~joined[:-1] & joined[1:]), np.flatnonzero(joined[:-1] & ~joined[1:])
+    total = sum(period[i : j + 1].sum() for i, j in zip(starts, ends, strict=True) if j - i + 2 >= RUN)
+    return float(total / length_s)

@@ -62,7 +62,8 @@ def icao_height(pressure_hpa: ArrayLike, reference_hpa: float = SEA_LEVEL_HPA) -
 
 def metres_a_hpa(pressure_hpa: float) -> float:
     """By how much the height falls where the pressure rises by 1 hPa: 8.3 m at sea level."""
-    return SEA_LEVEL_K / LAPSE_K_M / EXPONENT / pressure_hpa * (pressure_hpa / SEA_LEVEL_HPA) ** (1.0 / EXPONENT)
+    ratio = (pressure_hpa / SEA_LEVEL_HPA) ** (1.0 / EXPONENT)
+    return float(SEA_LEVEL_K / LAPSE_K_M / EXPONENT * ratio / pressure_hpa)
 
 
 class Height:

@@ -28,27 +28,30 @@ from smartnav_graph.calibration.model import StepNoise
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Window, key
-from smartnav_graph.steps import Steps, find_steps
+from smartnav_graph.steps import Steps, find_steps, regular_share
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 Floats = NDArray[np.float64]
 
+WALK = 0.3  # share of regular steps from which a device that nothing is said of is in the hand of a walker
 LEAST_UPRIGHT = 0.3  # least 1 + R_33: further from upright than 134 deg, yaw says little
 
 
 @dataclass(frozen=True)
 class StepConfig:
-    """enabled : ``auto`` (people on foot, or a walk where no vehicle is declared), ``on`` or ``off``; spacing_s : fixes
-    closer together than this carry the trajectory by themselves."""
+    """enabled : ``auto`` (in the hand of people on foot, or of a walker where no vehicle is declared), ``on`` or
+    ``off``; good_fix_m, spacing_s : fixes better and closer together than that carry the trajectory by themselves."""
 
     enabled: str = "auto"
+    good_fix_m: float = 0.3
     spacing_s: float = 5.0
 
     def __post_init__(self) -> None:
         if self.enabled not in ("auto", "on", "off"):
             raise ConfigError("config [steps]", f"enabled = {self.enabled!r}", "auto, on or off")
-        if self.spacing_s < 0:
-            raise ConfigError("config [steps]", f"spacing_s = {self.spacing_s}", ">= 0 s")
+        if self.spacing_s < 0 or self.good_fix_m < 0:
+            found = f"spacing_s = {self.spacing_s}, good_fix_m = {self.good_fix_m}"
+            raise ConfigError("config [steps]", found, ">= 0")
 
 
 def level_yaw(R: Floats) -> Floats:
@@ -96,7 +99,7 @@ def model_of(forward: str, up: str) -> Stride:
 class StepBuilder:
     """Adds one row a window in which steps are known and fixes are far apart.
 
-    fixes_ns : stamps of all fixes, in time order
+    fixes_ns : stamps of good fixes, in time order; note : what the run is told of it
     """
 
     steps: Steps
@@ -104,6 +107,7 @@ class StepBuilder:
     model: Stride
     noise: StepNoise
     config: StepConfig = field(default_factory=StepConfig)
+    note: str = ""
     name: str = "steps"
     stage: int = 0
 
@@ -143,7 +147,7 @@ class StepBuilder:
         return complex((part * np.exp(1j * middle)).sum())
 
     def _sparse(self, window: Window, memory: Memory) -> bool:
-        """Whether the fixes around a window are `spacing_s` apart; a replay knows those before it."""
+        """Whether the good fixes around a window are `spacing_s` apart; a replay knows those before it."""
         fixes, spacing = self.fixes_ns, round(self.config.spacing_s * NS)
         after = int(np.searchsorted(fixes, window.t1_ns))
         before = int(np.searchsorted(fixes, window.t0_ns, side="right")) - 1
@@ -157,12 +161,36 @@ class StepBuilder:
 
 
 def build(context: FactorContext) -> StepBuilder | None:
-    """The builder of a walker's steps."""
+    """The builder of a walker's steps; none for a foot-mounted device, whose stances say more."""
     config, session = context.config.steps, context.session
-    if config.enabled == "off" or (config.enabled == "auto" and (context.vehicle != "foot" or context.on_foot)):
+    by_hand = context.vehicle in ("foot", "none") and not context.on_foot
+    if config.enabled == "off" or (config.enabled == "auto" and not by_hand):
         return None
-    streams = (session.gnss, session.control, session.pose_fixes)
-    times = [stream.t_ns for stream in streams if stream is not None]
-    fixes = np.sort(np.concatenate([np.zeros(0, np.int64), *times]))
+    imu = session.require_imu()
+    steps = find_steps(imu)
+    share = regular_share(steps, float(session.seconds(imu.t_ns[-1])))
+    declared = config.enabled == "on" or context.vehicle == "foot"
+    if not (declared or share >= WALK):
+        return None
+    note = (
+        f"steps: a walk ({len(steps)} steps, {100 * share:.0f} % of the time regular); used between fixes that are far "
+        "apart, give --vehicle if it is none, or --steps.enabled off"
+    )
     model = model_of(session.device.forward, session.device.up)
-    return StepBuilder(find_steps(session.require_imu()), fixes, model, context.calibration.step_noise, config)
+    noise = context.calibration.step_noise
+    return StepBuilder(steps, _good_fixes(context), model, noise, config, "" if declared else note)
+
+
+def _good_fixes(context: FactorContext) -> NDArray[np.int64]:
+    """Stamps (n,) of the fixes that are better than `good_fix_m`; those without a sigma have their class's."""
+    session, least = context.session, context.config.steps.good_fix_m
+    found = [np.zeros(0, np.int64)]
+    for stream, usual in (
+        (session.gnss, context.calibration.gnss_noise.horizontal_sigma),
+        (session.control, context.config.control.default_sigma),
+        (session.pose_fixes, context.calibration.pose_fix_noise.position_sigma),
+    ):
+        if stream is not None:
+            sigma = np.full((len(stream), 2), usual) if stream.sigma is None else stream.sigma[:, :2]
+            found.append(stream.t_ns[np.where(np.isfinite(sigma), sigma, usual).max(axis=1) < least])
+    return np.sort(np.concatenate(found))
