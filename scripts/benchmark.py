@@ -68,7 +68,9 @@ def measure(kind: str, path: str) -> None:
 
     session, config = sn.load(path), sn.Config()
     if kind == "batch":
-        config = replace(config, gnss=replace(config.gnss, estimate_sigma=False))
+        gnss = replace(config.gnss, estimate_sigma=False, time_offset_sigma=0.0)
+        imu, run = replace(config.imu, estimate_noise=False), replace(config.run, vehicle="none")
+        config = replace(config, gnss=gnss, imu=imu, run=run)
     if kind == "replay":
         config = replace(config, replay=replace(config.replay, smoother="fixed-lag", lag_s=10.0, polish=False))
     begin = time.process_time()

@@ -1,4 +1,4 @@
-"""What one pass teaches the next: which fixes to reject, and how noisy fixes without a sigma are.
+"""What one pass teaches the next: which fixes to reject, and how noisy the sensors are.
 
 Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
 and rows inside the gate are let in again. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
@@ -21,6 +21,7 @@ from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.variance import noise_scales
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +30,10 @@ LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
+# Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
+# rest on few degrees of freedom and creep.
+STEADY = 0.1
+STEADY_INERTIAL = 0.25
 
 
 # A session state is held where the data leave more than this of its prior sigma.
@@ -151,7 +156,9 @@ def revise(
         return replace(new, phase="gated", rejected=outliers), False
     if memory.phase == "gated":
         new = replace(new, rejected=outliers)
-    steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < 0.1 for name in found)
+    steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < STEADY for name in found)
+    new, inertial_steady = _inertial(builders, windows, estimate, memory, new)
+    steady = steady and inertial_steady
     if not (steady and new.rejected == memory.rejected):
         return new, False
     grown = _grown(builders, estimate, new)
@@ -163,7 +170,7 @@ def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> M
     positions = position_builders(builders)
     wandering = frozenset(b.name for b in positions if b.wanders(memory))
     if memory.stage < LAST_STAGE:
-        later = any(b.stage == LAST_STAGE for b in builders) or any(b.grows(memory) for b in positions)
+        later = any(b.stage == LAST_STAGE or (hasattr(b, "grows") and b.grows(memory)) for b in builders)
         return replace(memory, stage=LAST_STAGE, correlated=wandering) if later else memory
     blind = {
         state.name: state.prior_mean
@@ -171,6 +178,19 @@ def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> M
         if not state.held and (state.sigma > OBSERVED * state.prior_sigma).all()
     }
     return replace(memory, held={**memory.held, **blind}, correlated=wandering)
+
+
+def _inertial(
+    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory, new: Memory
+) -> tuple[Memory, bool]:
+    """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
+    residuals hold more than noise: what they say is an upper bound."""
+    scales = noise_scales(builders, windows, estimate, memory)
+    if memory.stage < LAST_STAGE:
+        scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}
+        return replace(new, noise_scales={**new.noise_scales, **scales}), True
+    change = [abs(np.log(scale / memory.scale(name))) for name, scale in scales.items()]
+    return replace(new, noise_scales={**new.noise_scales, **scales}), max(change, default=0.0) < STEADY_INERTIAL
 
 
 def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Memory:

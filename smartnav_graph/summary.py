@@ -19,6 +19,7 @@ from smartnav_graph.problem import Problem
 from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
+from smartnav_graph.variance import NOISE_NAMES
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
 STATE_DIM = 15
@@ -165,6 +166,7 @@ def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, d
             "sigma": spread[0] if alone else spread,
             "held": state.held,
         }
+    found |= _inertial_noise(problem, memory)
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             found[f"{builder.name}_wander_sigma_m"] = {
@@ -180,6 +182,21 @@ def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, d
                 "held": False,
             }
     return found
+
+
+def _inertial_noise(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
+    """Noise densities and bias walks used; held where the data said too little of them."""
+    noise = problem.calibration.imu_noise
+    if not problem.config.imu.estimate_noise:
+        return {}
+    return {
+        name: {
+            "value": float(f"{getattr(noise, name) * memory.scale(group):.4g}"),
+            "sigma": None,
+            "held": group not in memory.noise_scales,
+        }
+        for group, name in NOISE_NAMES.items()
+    }
 
 
 def _sigma_summary(solution: Solution) -> dict[str, float]:

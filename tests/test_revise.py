@@ -12,6 +12,7 @@ from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNo
 from smartnav_graph.config import Config, RunConfig
 from smartnav_graph.estimate import initialise, solve_passes
 from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph import Memory
 from smartnav_graph.problem import prepare
@@ -130,7 +131,7 @@ def test_sigmas_too_small_by_three_reject_nothing_wholesale(drive, seed):
 def test_a_loss_that_is_no_gate_rejects_nothing(drive):
     session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
     for loss in ("huber", "none"):
-        problem = prepare(session, Config(gnss=GnssConfig(loss=loss)))
+        problem = prepare(session, Config(gnss=GnssConfig(loss=loss), imu=ImuConfig(estimate_noise=False)))
         graph = assemble(session, drive.truth)
         learnt, done = revise(problem.builders, graph.windows, estimate_of(graph), Memory())
         assert learnt.phase == "plain" and not learnt.rejected
@@ -207,4 +208,6 @@ def test_a_row_inside_the_gate_is_let_in_again(drive):
 
 def test_without_positions_there_is_nothing_to_learn(drive):
     graph = assemble(drive.session, drive.truth)
-    assert revise([graph.builders["imu"]], graph.windows, estimate_of(graph), Memory()) == (Memory(), True)
+    inertial = graph.builders["imu"]
+    inertial.config = ImuConfig(estimate_noise=False)
+    assert revise([inertial], graph.windows, estimate_of(graph), Memory()) == (Memory(), True)

@@ -12,13 +12,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.model import ImuNoise
+from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
@@ -30,14 +30,24 @@ Floats = NDArray[np.float64]
 
 # Bias steps, m/s^2 and rad/s, over which preintegration is repeated.
 STALE_BIAS = np.array([0.1] * 3 + [1e-3] * 3)
+# The same from one pass to the next: passes that come from elsewhere end at the same solution.
+KEPT_BIAS = 0.1 * STALE_BIAS
+
+
+# What the noise known before counts beside residuals, in degrees of freedom: that of a class is right within a factor
+# of two or so (its logarithm has sigma 1 / sqrt(2 nu) = 0.5), that of a calibrated device within a sixth.
+CLASS_WEIGHT = 2.0
+CALIBRATED_WEIGHT = 20.0
 
 
 @dataclass(frozen=True)
 class ImuConfig:
-    """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging."""
+    """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging;
+    estimate_noise : find noise densities and bias walks from the kept data (batch)."""
 
     integration_sigma: float = 1e-3
     gap_factor: float = 1.0
+    estimate_noise: bool = True
 
     def __post_init__(self) -> None:
         if not (self.integration_sigma > 0 and self.gap_factor > 0):
@@ -84,11 +94,47 @@ def bridge_noise(imu: Imu, gaps: Sequence[Gap], length_s: float, floor: ImuNoise
     return BridgeNoise(30.0 * least[:3], 30.0 * least[3:])
 
 
+def accel_part(windows: Sequence[Window], density: float) -> Floats:
+    """Covariance (m, 9, 9) of [rotation, position, velocity] by the accelerometer's white noise alone.
+
+    It is the same on all axes, so no rotation inside the window changes it: sums over the intervals of
+    dt (dt / 2 + rest)^2, dt (dt / 2 + rest) and dt, with `rest` the time to the window's end.
+    """
+    dt = np.concatenate([w.dt for w in windows])
+    counts = np.array([len(w.dt) for w in windows])
+    starts = np.cumsum(counts) - counts
+    since = np.cumsum(dt)
+    arm = np.repeat(since[starts + counts - 1], counts) - since + 0.5 * dt
+    pp, pv, vv = (density**2 * np.add.reduceat(dt * arm**power, starts) for power in (2, 1, 0))
+    part = np.zeros((len(windows), 9, 9))
+    for i in range(3):
+        part[:, 3 + i, 3 + i], part[:, 6 + i, 6 + i] = pp, vv
+        part[:, 3 + i, 6 + i] = part[:, 6 + i, 3 + i] = pv
+    return part
+
+
+def integration_part(windows: Sequence[Window], sigma: float) -> Floats:
+    """Covariance (m, 9, 9) by the error of the integration, in position; the rest is the gyroscope's."""
+    part = np.zeros((len(windows), 9, 9))
+    part[:, range(3, 6), range(3, 6)] = sigma**2 * np.array([[w.dt.sum()] for w in windows])
+    return part
+
+
+class Kept(NamedTuple):
+    """A window preintegrated in an earlier pass: at this bias (6,), with noise of these scales."""
+
+    window: Window
+    bias: Floats
+    scales: tuple[float, float]
+    pim: Any
+
+
 @dataclass
 class ImuBuilder:
     """Adds `ImuFactor` and the bias walk, and predicts the state at the window's end.
 
-    gravity m/s^2; `bridges` gives the noise of each gap by its start stamp.
+    gravity m/s^2; `bridges` gives the noise of each gap by its start stamp; weight : degrees of freedom that `noise`
+    counts for where the data are asked for it.
     """
 
     noise: ImuNoise
@@ -98,7 +144,13 @@ class ImuBuilder:
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
     stage: int = 0
+    weight: float = CLASS_WEIGHT
     _spent_s: float = 0.0
+    _kept: dict[int, Kept] = field(default_factory=dict)
+
+    def grows(self, memory: Memory) -> bool:
+        """Whether there is more to learn once the trajectory is found: the noise."""
+        return self.config.estimate_noise
 
     def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -121,8 +173,24 @@ class ImuBuilder:
         start = next(gap.start_ns for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
         return self.bridges[start]
 
+    def walk_sigma(self, memory: Memory) -> Floats:
+        """Random walk (6,) of the biases over one second, accelerometer then gyroscope."""
+        accel = self.noise.accel_bias_walk * memory.scale("accel_walk")
+        return np.array([accel] * 3 + [self.noise.gyro_bias_walk * memory.scale("gyro_walk")] * 3)
+
     def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
-        """GTSAM preintegrated measurements of one window, linearised at `bias`."""
+        """GTSAM preintegrated measurements of one window, linearised at `bias` or, where that is good enough, as an
+        earlier pass left them."""
+        scales, vector = (memory.scale("accel"), memory.scale("gyro")), bias.vector()
+        kept = self._kept.get(window.index)
+        fresh = kept is not None and kept.window is window and (np.abs(vector - kept.bias) < KEPT_BIAS).all()
+        if kept is not None and fresh and (kept.scales == scales or window.kind != "gap"):
+            return kept.pim
+        pim = self._integrated(window, bias, memory)
+        self._kept[window.index] = Kept(window, vector, scales, pim)
+        return pim
+
+    def _integrated(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
         begin = time.perf_counter()
         pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, memory), bias)
         integrate = pim.integrateMeasurement
@@ -135,6 +203,19 @@ class ImuBuilder:
         """Wall seconds of preintegration since the last call."""
         seconds, self._spent_s = self._spent_s, 0.0
         return seconds
+
+    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.ImuFactor:
+        """Factor of a window with the noise of `memory`, whatever noise it was preintegrated with."""
+        i, j = window.index - 1, window.index
+        factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
+        scales, old = (memory.scale("accel"), memory.scale("gyro")), self._kept[j].scales
+        if scales == old:
+            return factor
+        accel = accel_part([window], self.noise.accel_noise_density)[0]
+        integration = integration_part([window], self.config.integration_sigma)[0]
+        gyro = (pim.preintMeasCov() - old[0] ** 2 * accel - integration) / old[1] ** 2
+        covariance = scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration
+        return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.Covariance(covariance))
 
     def _params_of(self, window: Window, memory: Memory) -> gtsam.PreintegrationParams:
         bridge = self._bridge(window)
@@ -165,20 +246,17 @@ class ImuBuilder:
         step.foretell = pim.predict
         if previous.covariance is not None:
             step.variance = self._variance(pim, window.length_s, previous, previous.covariance)
-        used = previous.bias.vector()
+        used = pim.biasHat().vector()
 
         def refresh(bias: Any) -> Any:
             if (np.abs(bias.vector() - used) < STALE_BIAS).all():
                 return None
-            return _factor(i, j, self.preintegrate(window, bias, memory))
+            return self._factor(window, self.preintegrate(window, bias, memory), memory)
 
         step.refresh = refresh
-        step.add(Tag("imu", window.t1_ns), _factor(i, j, pim))
+        step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
         root = np.sqrt(window.length_s)
-        walk = np.array(
-            [self.noise.accel_bias_walk * memory.scale("accel_walk") * root] * 3
-            + [self.noise.gyro_bias_walk * memory.scale("gyro_walk") * root] * 3
-        )
+        walk = self.walk_sigma(memory) * root
         step.add(
             Tag("imu_bias", window.t1_ns),
             gtsam.BetweenFactorConstantBias(
@@ -187,12 +265,10 @@ class ImuBuilder:
         )
 
 
-def _factor(i: int, j: int, pim: Any) -> gtsam.ImuFactor:
-    return gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
-
-
 def build(context: FactorContext) -> ImuBuilder:
     """The builder of a session's inertial data."""
     imu, noise = context.session.require_imu(), context.calibration.imu_noise
     bridges = {gap.start_ns: bridge_noise(imu, context.gaps, gap.length_s, noise) for gap in context.gaps}
-    return ImuBuilder(noise, context.session.gravity, context.gaps, bridges, context.config.imu)
+    known = noise != DEVICE_CLASSES[context.calibration.device_class]
+    weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
+    return ImuBuilder(noise, context.session.gravity, context.gaps, bridges, context.config.imu, weight=weight)
