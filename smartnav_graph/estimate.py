@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.assemble import Withheld, causal_solution, densify, score, to_solution, used_counts
+from smartnav_graph.assemble import Withheld, carried_over, causal_solution, densify, score, to_solution, used_counts
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
@@ -28,18 +28,24 @@ from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
-from smartnav_graph.problem import Problem, prepare
+from smartnav_graph.late import known_ns
+from smartnav_graph.problem import Problem, prepare, recut
 from smartnav_graph.revise import position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
-from smartnav_graph.smoothers.estimate import Estimate, largest_difference
+from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
 from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.summary import summarise
 
 Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
+
+
+# A polish that moves a state further than this starts anew from what it found.
+FAR_M, FAR_DEG = 0.1, 1.0
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -176,12 +182,13 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         return estimate, memory
 
     given = Given.parse(problem.config.run.initial) if problem.config.run.initial else None
-    t_ns, positions, sources = _absolute_positions(problem)
+    t_ns, positions, sources, known = _absolute_positions(problem)
     initialiser = Initialiser(
         windows=problem.windows,
         imu=session.require_imu(),
         fixes=(t_ns, positions),
         sources=sources,
+        arrival_ns=None if longest_s is None else known,
         fix_sigma=max((float(np.median(b.sigma)) for b in position_builders(problem.builders)), default=1.0),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
@@ -218,16 +225,17 @@ def _north(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _absolute_positions(problem: Problem) -> tuple[NDArray[np.int64], Floats, list[tuple[str, int]]]:
-    """Stamps, nav positions, and sensor and row of all absolute measurements, in time order."""
+def _absolute_positions(problem: Problem) -> tuple[Times, Floats, list[tuple[str, int]], Times]:
+    """Stamps, nav positions, sensor and row, and arrival of all absolute measurements, in time order."""
     streams = {name: stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None}
     if not streams:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), []
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), [], np.zeros(0, dtype=np.int64)
     t = np.concatenate([stream.t_ns for stream in streams.values()])
     p = np.concatenate([problem.session.nav_position(stream) for stream in streams.values()])
     sources = [(name, row) for name, stream in streams.items() for row in range(len(stream))]
     order = np.argsort(t, kind="stable")
-    return t[order], p[order], [sources[i] for i in order]
+    known = np.concatenate([known_ns(stream) for stream in streams.values()])
+    return t[order], p[order], [sources[i] for i in order], known[order]
 
 
 def smooth(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:
@@ -297,7 +305,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         As `smooth`.
     """
     clock = Clock()
-    problem = prepare(session, config or Config())
+    problem = prepare(session, config or Config(), causal=True)
     clock.lap("prepare")
     initial = initialise(problem, longest_s=30.0)
     clock.lap("initialise")
@@ -305,7 +313,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     smoother = incremental(options, problem.session.t0_ns)
     builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
-    memory = replace(initial.memory, phase="causal", rejected={}, correlated=wandering, stage=LAST_STAGE)
+    memory = replace(initial.memory, phase="causal", correlated=wandering, stage=LAST_STAGE)
     latency: list[float] = []
     states: list[State] = []
     interrupted = False
@@ -323,32 +331,49 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         if len(states) < 2:
             raise
     clock.lap("replay")
-    done = len(states)
-    problem = replace(problem, windows=problem.windows[:done])
-    before = smoother.estimate(done)
+    problem = _counted(replace(problem, windows=problem.windows[: len(states)]), smoother.dropped)
+    estimate = smoother.estimate(len(states))
+    causal = causal_solution(problem, states)
     extra: dict[str, Any] = {
         "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
         "update_ms": {name: float(f(latency)) for name, f in _LATENCY.items()},
         "delay_s": initial.stretch_s,
     }
-    estimate, passes = before, 0
     if options.polish:
         try:
-            estimate, memory, passes = solve_passes(
-                problem,
-                problem.windows,
-                initial.prior,
-                initial.memory,
-                warm=before.values,
-                progress=progress,
-            )
+            last = problem.windows[-1].t1_ns if interrupted else None
+            problem, estimate, memory, extra["polish"] = _polished(problem, estimate, initial, last, progress)
         except KeyboardInterrupt:
             extra["mode"] += ", polish interrupted"
-        metres, degrees = largest_difference(before, estimate)
-        extra |= {"polish": {"largest_change_m": metres, "largest_change_deg": degrees, "passes": passes}}
         clock.lap("polish")
-    causal = causal_solution(problem, states)
     return _finish(problem, initial, estimate, memory, clock, extra, causal)
+
+
+def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:
+    """The problem with the rows that came too late for the smoother."""
+    streams = problem.session.streams()
+    counts = {name: count for name, count in too_late.items() if count and name in streams}
+    return problem.with_dropped("older than the lag", counts)
+
+
+def _polished(
+    problem: Problem, estimate: Estimate, initial: Initial, known_ns: int | None, progress: Progress
+) -> tuple[Problem, Estimate, Memory, dict[str, float]]:
+    """Everything once more by batch, every row at the time it speaks of, and how far that moved the estimate.
+
+    What is made at the states before (preintegrated windows, delayed fixes) is made anew where they moved far.
+    """
+    whole = recut(problem, known_ns)
+    warm = estimate.values if whole is problem else carried_over(problem, estimate, whole.windows)
+    memory, total, told = initial.memory, 0, {}
+    while True:
+        found, memory, passes = solve_passes(whole, whole.windows, initial.prior, memory, warm=warm, progress=progress)
+        metres, degrees = distance(states_of(warm, found.indices), found.states())
+        told = told or {"largest_change_m": metres, "largest_change_deg": degrees}
+        total += passes
+        if (metres < FAR_M and degrees < FAR_DEG) or total >= whole.config.run.passes:
+            return whole, found, memory, {**told, "passes": total}
+        warm = found.values
 
 
 _LATENCY: Mapping[str, Callable[[Sequence[float]], Any]] = {

@@ -345,14 +345,16 @@ class Initialiser:
 
     def _count(self, stretch_s: float) -> int:
         """Windows up to `stretch_s` after the first fix."""
-        begin = max(int(self.fixes[0][0]), self.windows[0].t1_ns)
+        begin = max(int(self._arrival().min()), self.windows[0].t1_ns)
         ends = np.array([w.t1_ns for w in self.windows])
         return int(np.searchsorted(ends, begin + int(stretch_s * NS), side="right"))
 
     def _known(self, now_ns: int) -> NDArray[np.bool_]:
         """Mask of the fixes that speak of, and were known by, this time."""
-        known = self.fixes[0] if self.arrival_ns is None else self.arrival_ns
-        return np.asarray((self.fixes[0] <= now_ns) & (known <= now_ns))
+        return np.asarray((self.fixes[0] <= now_ns) & (self._arrival() <= now_ns))
+
+    def _arrival(self) -> NDArray[np.int64]:
+        return self.fixes[0] if self.arrival_ns is None else self.arrival_ns
 
     def _candidates(self, count: int, rest: Rest | None, before: Sequence[State]) -> list[tuple[State, Memory]]:
         """First states to try, those that most fixes agree on first, with the rows that do not."""
