@@ -28,6 +28,7 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe, skew, turned
 from smartnav_graph.graph import STATES, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.standstill import Standstills
 from smartnav_graph.timebase import NS, Gap
 
 Floats = NDArray[np.float64]
@@ -176,12 +177,14 @@ def due(window: Window, period_s: float) -> bool:
 class VehicleBuilder:
     """Adds one row of the constraint a period, outside gaps and standstills.
 
-    body_R_vehicle (3, 3) : declared axes; gaps : where rate and force are not known
+    body_R_vehicle (3, 3) : declared axes; gaps : where rate and force are not known; rests : where zero velocity says
+    it all already
     """
 
     body_R_vehicle: Floats
     noise: VehicleNoise
     gaps: Sequence[Gap] = ()
+    rests: Standstills | None = None
     config: VehicleConfig = VehicleConfig()
     name: str = "vehicle"
     stage: int = 1
@@ -192,7 +195,7 @@ class VehicleBuilder:
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where one is due."""
-        if not len(window.dt) or not due(window, self.config.period_s) or self._inside_gap(window.t1_ns):
+        if not len(window.dt) or not due(window, self.config.period_s) or self._silent(window.t1_ns):
             return
         rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
         force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
@@ -202,8 +205,9 @@ class VehicleBuilder:
         keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.config)))
         step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))
 
-    def _inside_gap(self, t_ns: int) -> bool:
-        return any(gap.start_ns < t_ns < gap.end_ns for gap in self.gaps)
+    def _silent(self, t_ns: int) -> bool:
+        still = self.rests is not None and np.isfinite(self.rests.speed_at(t_ns))
+        return bool(still) or any(gap.start_ns < t_ns < gap.end_ns for gap in self.gaps)
 
 
 def build(context: FactorContext) -> VehicleBuilder | None:
@@ -212,4 +216,5 @@ def build(context: FactorContext) -> VehicleBuilder | None:
     if noise is None or not config.enabled:
         return None
     device = context.session.device
-    return VehicleBuilder(frames.body_R_vehicle(device.forward, device.up), noise, context.gaps, config)
+    axes = frames.body_R_vehicle(device.forward, device.up)
+    return VehicleBuilder(axes, noise, context.gaps, context.rests, config)

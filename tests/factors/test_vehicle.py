@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 from numeric import assert_observation, random_rotations
 
-from smartnav_graph.factors.vehicle import MOUNT_SIZE, NonHolonomic
+from smartnav_graph.calibration.model import VEHICLE_CLASSES
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.vehicle import MOUNT_SIZE, NonHolonomic, VehicleBuilder, VehicleConfig, recent
 from smartnav_graph.frames import body_R_vehicle
+from smartnav_graph.graph import Memory, Step, Window, key
+from smartnav_graph.standstill import Standstills
+from smartnav_graph.timebase import NS, Gap
 
 PHONE = NonHolonomic(body_R_vehicle("+y", "+z"))
 COMMA = NonHolonomic(body_R_vehicle("+x", "-z"))
@@ -76,3 +82,72 @@ def test_derivatives(model):
     state = rng.normal(0, 1, (m, MOUNT_SIZE)) * [0.5, 0.5, 1, 1, 1, 1, 0.02, 0.02]
     R, p, v = random_rotations(rng, m), rng.normal(0, 100, (m, 3)), rng.normal(0, 10, (m, 3))
     assert_observation(model, R, p, v, [state], data)
+
+
+# --- the builder ------------------------------------------------------------------------------------------------------
+
+AXES = body_R_vehicle("+y", "+z")
+
+
+def window(t0_s: float, t1_s: float) -> Window:
+    """Inertial intervals of 10 ms: turning ever faster to the left, pushed ahead at 2 m/s^2 in the last 0.3 s."""
+    n = round((t1_s - t0_s) * 100)
+    gyro, accel = np.zeros((n, 3)), np.tile([0.0, 0.0, 9.8], (n, 1))
+    gyro[:, 2] = np.arange(n) / 100
+    accel[-30:, 1] = 2.0
+    return Window(3, round(t0_s * NS), round(t1_s * NS), "normal", np.full(n, 0.01), accel, gyro)
+
+
+def rows(builder: VehicleBuilder, at: Window, memory: Memory | None = None) -> list:
+    step = Step(at.index, at.t1_ns, at.t1_ns / NS)
+    step.bias = gtsam.imuBias.ConstantBias(np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.0, 0.1]))
+    builder.add(step, at, None, memory or Memory(stage=1))
+    return step.blocks
+
+
+def car(**options) -> VehicleBuilder:
+    return VehicleBuilder(AXES, VEHICLE_CLASSES["car"], **options)
+
+
+def test_a_row_holds_rate_and_force_of_the_last_moments_without_bias():
+    (block,) = rows(car(), window(10.0, 11.0))
+    noise = VEHICLE_CLASSES["car"]
+    rate = [0.0, 0.0, np.arange(95, 100).mean() / 100 - 0.1]
+    np.testing.assert_allclose(block.data[0], [*rate, 1.5, 0.0, 9.8, noise.lateral_sigma, noise.vertical_sigma])
+    assert block.keys == [(key("X", 3), key("V", 3), key("M", 6))]
+
+
+def test_noise_found_from_the_data_scales_each_row():
+    memory = Memory(stage=1, noise_scales={"vehicle_lateral": 2.0, "vehicle_vertical": 3.0})
+    (block,) = rows(car(), window(10.0, 11.0), memory)
+    noise = VEHICLE_CLASSES["car"]
+    assert block.data[0, 6:] == pytest.approx([2 * noise.lateral_sigma, 3 * noise.vertical_sigma])
+
+
+def test_one_row_a_second_however_many_keyframes():
+    builder = car()
+    edges = np.arange(10.0, 20.0, 0.25)
+    assert sum(len(rows(builder, window(a, a + 0.25))) for a in edges) == 10
+
+
+def test_no_row_inside_a_gap_but_one_at_its_end():
+    builder = car(gaps=[Gap(round(10.4 * NS), 13 * NS, "missing")])
+    assert [len(rows(builder, window(a, a + 1.0))) for a in (9.0, 10.0, 11.0, 12.0, 13.0)] == [1, 0, 0, 1, 1]
+
+
+def test_no_row_at_a_standstill():
+    t_ns = np.arange(0, 20 * NS, NS // 10)
+    still = np.where((t_ns > 9.5 * NS) & (t_ns < 12.5 * NS), 0.01, np.nan)
+    builder = car(rests=Standstills(t_ns, still, still))
+    assert [len(rows(builder, window(a, a + 1.0))) for a in (8.0, 9.0, 10.0, 11.0, 12.0)] == [1, 0, 0, 0, 1]
+
+
+def test_the_mean_of_the_last_moments_takes_the_last_interval_at_least():
+    at = window(0.0, 0.02)
+    assert recent(at, at.gyro, 0.001) == pytest.approx([0.0, 0.0, 0.01])
+
+
+@pytest.mark.parametrize("options", [{"period_s": 0.0}, {"mount_sigma_deg": -1.0}, {"loss": "tukey"}])
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(ConfigError, match=r"^config \[vehicle\]: .*; expected "):
+        VehicleConfig(**options)
