@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from smartnav_graph.errors import SessionError
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
-from smartnav_graph.graph import Memory, State
+from smartnav_graph.graph import Memory, State, Window, key
 from smartnav_graph.prediction import Kinematics, states_at
 from smartnav_graph.problem import Problem
 from smartnav_graph.revise import fix_residuals, position_builders
@@ -66,6 +66,21 @@ def to_solution(problem: Problem, estimate: Estimate, memory: Memory) -> Solutio
     """The keyframes with their residuals."""
     solution = _solution(problem, estimate.t_ns, Kinematics(*estimate.states()), estimate.covariance)
     return replace(solution, residuals=residuals(problem, estimate, memory))
+
+
+def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]) -> Any:
+    """An estimate as gtsam.Values for other windows of the same stretch: states as foretold inside its own windows,
+    session states as they are."""
+    t_ns = np.array([window.t1_ns for window in windows], dtype=np.int64)
+    there = states_at(problem.windows, Kinematics(*estimate.states()), problem.session.gravity, t_ns)
+    values = gtsam.Values()
+    for window, R, p, v, bias in zip(windows, *there, strict=True):
+        values.insert(key("X", window.index), gtsam.Pose3(gtsam.Rot3(R), p))
+        values.insert(key("V", window.index), v)
+        values.insert(key("B", window.index), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+    for state in estimate.session.values():
+        values.insert(state.key, state.value)
+    return values
 
 
 def causal_solution(problem: Problem, states: Sequence[State]) -> Solution:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph import health
+from smartnav_graph import health, late
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
@@ -42,6 +42,16 @@ class Problem:
     def vehicle(self) -> str:
         return self.config.run.vehicle or self.session.device.vehicle
 
+    def with_dropped(self, reason: str, counts: Mapping[str, int]) -> Problem:
+        """The same with more rows counted as dropped, and told."""
+        if not counts:
+            return self
+        dropped = {**self.dropped}
+        for name, count in counts.items():
+            dropped[name] = {**dropped.get(name, {}), reason: count}
+        told = [_dropped_text(name, {reason: count}) for name, count in counts.items()]
+        return replace(self, dropped=dropped, warnings=[*self.warnings, *told])
+
     @property
     def rests_at_start(self) -> bool:
         """Whether the first keyframe lies in a true rest that standstill factors speak for."""
@@ -55,8 +65,10 @@ class Problem:
         )
 
 
-def prepare(session: Session, config: Config) -> Problem:
+def prepare(session: Session, config: Config, *, causal: bool = False) -> Problem:
     """Check the session, choose sensors and stretch, find gaps, cut windows, make builders.
+
+    `causal` : a row is used when it becomes known (replay); otherwise at the time it speaks of.
 
     Raises
     ------
@@ -91,18 +103,52 @@ def prepare(session: Session, config: Config) -> Problem:
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still)
-    spacing = config.keyframes
-    if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
-        spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, still.swing_s))
-    standing = rests.keyframes(still.stance_s if rests.on_foot else None)
-    times = keyframe_times(span, list(aiding.values()), gaps, spacing, standing)
-    windows = make_windows(imu, times, gaps, aiding, spacing, rests.spans())
+    windows, lost = cut(session, config, span, gaps, rests, causal=causal)
+    for name, count in lost.items():
+        dropped.setdefault(name, {})["arrived after the end"] = count
     context = FactorContext(session, calibration, gaps, vehicle, config, rests)
     builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
     warnings = [*warnings, *told, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
     return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests)
+
+
+def cut(
+    session: Session,
+    config: Config,
+    span: tuple[int, int],
+    gaps: Sequence[Gap],
+    rests: Standstills,
+    *,
+    causal: bool,
+) -> tuple[list[Window], dict[str, int]]:
+    """The windows of a stretch, and how many rows of each stream are not known by its end."""
+    spacing, still = config.keyframes, config.standstill
+    if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
+        spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, still.swing_s))
+    standing = rests.keyframes(still.stance_s if rests.on_foot else None)
+    merge = round(spacing.merge_s * NS)
+    streams = {name: stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
+    aiding = {name: stream.t_ns for name, stream in streams.items()}
+    epochs = [s.t_ns[~late.is_late(s, merge)] if causal else s.t_ns for s in streams.values()]
+    times = keyframe_times(span, epochs, gaps, spacing, standing)
+    windows = make_windows(session.require_imu(), times, gaps, aiding, spacing, rests.spans())
+    return late.arrange(windows, streams, merge) if causal else (windows, {})
+
+
+def recut(problem: Problem, known_ns: int | None = None) -> Problem:
+    """The same stretch with every row at the time it speaks of; only rows known by `known_ns` where that is given.
+    The problem itself where no row is late."""
+    merge = round(problem.config.keyframes.merge_s * NS)
+    if not any(late.is_late(s, merge).any() for name in ABSOLUTE if (s := getattr(problem.session, name)) is not None):
+        return problem
+    session, span = problem.session, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns)
+    rests = problem.rests or Standstills.none(session.require_imu().t_ns)
+    windows, _ = cut(session, problem.config, span, problem.gaps, rests, causal=False)
+    if known_ns is not None:
+        windows = late.forget(windows, session.streams(), known_ns)
+    return replace(problem, windows=windows)
 
 
 def _choose_sensors(session: Session, chosen: Sequence[str]) -> Session:

@@ -131,7 +131,12 @@ def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floa
 
 def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
     """Largest distance m and rotation angle deg over the keyframes of two estimates of the same problem."""
-    (Ra, pa, _, _), (Rb, pb, _, _) = one.states(), other.states()
+    return distance(one.states(), other.states())
+
+
+def distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, float]:
+    """Largest distance m and rotation angle deg between keyframe states (see `Estimate.states`)."""
+    Ra, pa, Rb, pb = *one[:2], *other[:2]
     trace = np.einsum("nij,nij->n", Ra, Rb)
     sine = np.linalg.norm(Ra - Rb, axis=(1, 2)) / np.sqrt(8.0)  # of half the angle: exact where the cosine is flat
     angle = np.where(trace > 0, 2.0 * np.arcsin(np.clip(sine, 0, 1)), np.arccos(np.clip((trace - 1) / 2, -1, 1)))
