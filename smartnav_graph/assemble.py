@@ -155,7 +155,8 @@ def _flat(parts: Sequence[Part]) -> Residuals:
     )
 
 
-def _kinematics(solution: Solution) -> Kinematics:
+def kinematics(solution: Solution) -> Kinematics:
+    """The states of a solution as `prediction` takes them."""
     bias = np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
     return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
 
@@ -171,7 +172,7 @@ def score(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str
             continue
         t_ns = rows.t_ns + round(estimate.offset_s(name) * NS)
         known = np.clip(t_ns, keyframes.t_ns[0], keyframes.t_ns[-1])
-        there = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, known)
+        there = states_at(problem.windows, kinematics(keyframes), problem.session.gravity, known)
         lever = problem.session.lever_arms(rows) + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
         p = there.p + there.v * ((t_ns - known) / NS)[:, None] + turned(there.R, lever)
         scored[name] = Withheld(rows.t_ns, p - problem.session.nav_position(rows))
@@ -191,7 +192,7 @@ def densify(problem: Problem, keyframes: Solution) -> Solution:
         t_ns = first + ns_from_seconds(np.arange(0.0, (last - first) / 1e9, 1.0 / float(rate)))
     if len(t_ns) > 2_000_000:
         raise SessionError("--rate", f"{len(t_ns)} output rows", "at most 2 000 000", "ask for a lower rate")
-    states = states_at(problem.windows, _kinematics(keyframes), problem.session.gravity, t_ns)
+    states = states_at(problem.windows, kinematics(keyframes), problem.session.gravity, t_ns)
     flat = interpolate(t_ns, keyframes.t_ns, keyframes.covariance.reshape(-1, 225))
     return replace(_solution(problem, t_ns, states, flat.reshape(-1, 15, 15)), residuals=keyframes.residuals)
 

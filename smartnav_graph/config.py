@@ -18,6 +18,7 @@ from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.gravity import GravityConfig
 from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.magnetometer import MagnetometerConfig
+from smartnav_graph.factors.pose_fix import PoseFixConfig
 from smartnav_graph.factors.prior import PriorConfig
 from smartnav_graph.factors.step import StepConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
@@ -90,6 +91,7 @@ class Config:
     imu: ImuConfig = field(default_factory=ImuConfig)
     gnss: GnssConfig = field(default_factory=GnssConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    pose_fixes: PoseFixConfig = field(default_factory=PoseFixConfig)
     standstill: StandstillConfig = field(default_factory=StandstillConfig)
     magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
     gravity: GravityConfig = field(default_factory=GravityConfig)

@@ -60,14 +60,16 @@ def states_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_n
     return out
 
 
-def _inside(
+def _integrated(
     windows: Sequence[Window],
     index: NDArray[np.intp],
     states: Kinematics,
     gravity: float,
     where: NDArray[np.intp],
     t_ns: NDArray[np.int64],
-) -> Kinematics:
+) -> tuple[Kinematics, Kinematics]:
+    """From the keyframe before each window (rows `index` - 1 of `states`) to the times t_ns (q,), each inside window
+    `where` (q,), and to the windows' ends."""
     count, depth = len(windows), max(len(w.dt) for w in windows)
     dt = np.zeros((count, depth))
     accel, gyro = np.zeros((count, depth, 3)), np.zeros((count, depth, 3))
@@ -85,21 +87,45 @@ def _inside(
     for j in range(depth):
         R[j + 1], p[j + 1], v[j + 1] = _advance(R[j], p[j], v[j], accel[:, j], gyro[:, j], dt[:, j], g)
 
-    start = np.array([w.t0_ns for w in windows], dtype=np.int64)
-    length = np.array([w.length_s for w in windows])
-    tau = (t_ns - start[where]) / NS
+    ends = Kinematics(R[depth], p[depth], v[depth], states.bias[index - 1])
+    tau = (t_ns - np.array([w.t0_ns for w in windows], dtype=np.int64)[where]) / NS
     border = np.concatenate([np.zeros((count, 1)), np.cumsum(dt, axis=1)], axis=1)
     j = np.minimum((border[where] <= tau[:, None]).sum(axis=1) - 1, depth - 1)
     part = tau - border[where, j]
     Rq, pq, vq = _advance(R[j, where], p[j, where], v[j, where], accel[where, j], gyro[where, j], part, g)
+    return Kinematics(Rq, pq, vq, ends.bias[where]), ends
 
-    turn = Rotation.from_matrix(R[depth].transpose(0, 2, 1) @ states.R[index]).as_rotvec()
-    dp, dv = states.p[index] - p[depth], states.v[index] - v[depth]
-    x, T = (tau / length[where])[:, None], length[where][:, None]
-    dp, dv = dp[where], dv[where]
+
+def _inside(
+    windows: Sequence[Window],
+    index: NDArray[np.intp],
+    states: Kinematics,
+    gravity: float,
+    where: NDArray[np.intp],
+    t_ns: NDArray[np.int64],
+) -> Kinematics:
+    there, ends = _integrated(windows, index, states, gravity, where, t_ns)
+    start, length = (np.array([getattr(w, name) for w in windows]) for name in ("t0_ns", "length_s"))
+    turn = Rotation.from_matrix(ends.R.transpose(0, 2, 1) @ states.R[index]).as_rotvec()
+    dp, dv = (states.p[index] - ends.p)[where], (states.v[index] - ends.v)[where]
+    T = length[where][:, None]
+    x = ((t_ns - start[where]) / NS)[:, None] / T
     return Kinematics(
-        Rq @ _exp(x * turn[where]),
-        pq + dp * (3 * x**2 - 2 * x**3) + dv * T * (x**3 - x**2),
-        vq + dp / T * (6 * x - 6 * x**2) + dv * (3 * x**2 - 2 * x),
+        there.R @ _exp(x * turn[where]),
+        there.p + dp * (3 * x**2 - 2 * x**3) + dv * T * (x**3 - x**2),
+        there.v + dp / T * (6 * x - 6 * x**2) + dv * (3 * x**2 - 2 * x),
         (1 - x) * states.bias[index - 1][where] + x * states.bias[index][where],
     )
+
+
+def foretold_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
+    """States that the keyframe before foretells, at times in (windows[0].t1_ns, windows[-1].t1_ns].
+
+    At a keyframe's own time that is what was foretold of it. Parameters as `states_at`; `states` may be causal ones.
+    """
+    ends = np.array([w.t1_ns for w in windows], dtype=np.int64)
+    index = np.searchsorted(ends, t_ns)
+    if len(t_ns) and (index.max() >= len(windows) or index.min() < 1):
+        raise ValueError("a time outside the windows")
+    used, where = np.unique(index, return_inverse=True)
+    return _integrated([windows[k] for k in used], used, states, gravity, where, t_ns)[0]

@@ -14,6 +14,7 @@ from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors import ABSOLUTE, BUILDERS
 from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.pose_fix import at_their_time
 from smartnav_graph.graph import Builder, Window
 from smartnav_graph.keyframes import keyframe_times, make_windows
 from smartnav_graph.session import Session
@@ -94,7 +95,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     checked.raise_errors()
     warnings = checked.warnings()
     session = _choose_sensors(session, config.run.sensors)
-    session, withheld = split(session, config.run.withhold)
+    session, withheld = split(at_their_time(session, config.pose_fixes), config.run.withhold)
     session, dropped = _inside_span(session, asked)
     aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
     span, told = _trimmed(asked, aiding, config.keyframes.lead_s, session.t0_ns)
@@ -110,7 +111,8 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
-    warnings = [*warnings, *told, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
+    notes = [note for b in builders if (note := getattr(b, "note", ""))]
+    warnings = [*warnings, *told, *notes, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
     return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests)
 
 

@@ -82,6 +82,14 @@ class BarometerNoise:
 
 
 @dataclass(frozen=True)
+class PoseFixNoise:
+    """Pose fixes that carry no sigma of their own, as of image recognition: position m, attitude rad, each an axis."""
+
+    position_sigma: float = 0.3
+    attitude_sigma: float = 0.035
+
+
+@dataclass(frozen=True)
 class StepNoise:
     """What is known of a walker before the first step.
 
@@ -144,12 +152,13 @@ class Calibration:
     device_class: str = "mems"
     imu_noise: ImuNoise = field(default_factory=lambda: DEVICE_CLASSES["mems"])
     gnss_noise: GnssNoise = field(default_factory=GnssNoise)
+    pose_fix_noise: PoseFixNoise = field(default_factory=PoseFixNoise)
     barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
     step_noise: StepNoise = field(default_factory=StepNoise)
     magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
 
     def __post_init__(self) -> None:
-        for room in (self.imu_noise, self.gnss_noise, self.barometer_noise, self.step_noise):
+        for room in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
             for f in dataclasses.fields(room):
                 value = getattr(room, f.name)
                 may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")

@@ -11,6 +11,7 @@ from smartnav_graph.factors import (
     gravity,
     imu,
     magnetometer,
+    pose_fix,
     standstill,
     step,
     vehicle,
@@ -25,6 +26,8 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "imu": imu.build,
     "gnss": gnss.build,
     "control": control.build,
+    "pose_fixes": pose_fix.build,
+    "pose_attitude": pose_fix.build_attitude,
     "static": standstill.build,
     "gnss_velocity": velocity.build_gnss,
     "velocity": velocity.build,
@@ -36,4 +39,4 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "steps": step.build,
 }
 # Streams that hold the trajectory by themselves. Their rows make keyframes.
-ABSOLUTE = ("gnss", "control")
+ABSOLUTE = ("gnss", "control", "pose_fixes")
