@@ -1,0 +1,260 @@
+"""Fixes from elsewhere: image recognition, a total station, WiFi. Position, and attitude where the row has one.
+
+    position   nav_t_body + nav_R_body (body_t_sensor + L) - fix = 0                     `gnss.PositionBuilder`
+    attitude   Log(nav_R_body body_R_sensor Exp(A) fix^T) = 0                            rad, nav axes
+
+Both at the time t + T that a row stamped t speaks of. L and A correct the mount of the sensor, T its clock; they are
+states. L and A have a prior only where the session does not state the mount.
+
+Source: Sola, Deray, Atchuthan (2018), A micro Lie theory for state estimation in robotics, for the derivatives of Log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.calibration.model import GnssNoise
+from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, Partial, exp, here, preintegrated, skew
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Window, key
+from smartnav_graph.session import Session
+from smartnav_graph.streams import PoseFix
+from smartnav_graph.timebase import NS
+
+Floats = NDArray[np.float64]
+
+NAME = "pose_fixes"
+ATTITUDE = "pose_attitude"
+
+
+@dataclass(frozen=True)
+class PoseFixConfig:
+    """loss, gate_probability : as for GNSS fixes; attitude : use the attitudes of rows that have one;
+    latency_s : known delay of the stamps, a row stamped t speaks of t - latency_s and became known at t;
+    time_offset_sigma : s, prior of what is left of it, a state (zero: none);
+    lever_arm_sigma : m, mount_sigma_deg : deg, priors of the corrections of a mount that the session does not state."""
+
+    loss: str = "gate"
+    gate_probability: float = 0.999
+    attitude: bool = True
+    latency_s: float = 0.0
+    time_offset_sigma: float = 0.2
+    lever_arm_sigma: float = 0.1
+    mount_sigma_deg: float = 3.0
+
+    def __post_init__(self) -> None:
+        GnssConfig(loss=self.loss, gate_probability=self.gate_probability)
+        if min(self.latency_s, self.time_offset_sigma, self.lever_arm_sigma, self.mount_sigma_deg) < 0:
+            raise ConfigError("config [pose_fixes]", "latency_s or a sigma < 0", ">= 0")
+
+
+def at_their_time(session: Session, config: PoseFixConfig) -> Session:
+    """The session with its pose fixes stamped with the time they speak of, where their latency is known."""
+    fixes = session.pose_fixes
+    if fixes is None or config.latency_s == 0:
+        return session
+    known = fixes.t_ns if fixes.arrival_ns is None else fixes.arrival_ns
+    stamps = fixes.t_ns - round(config.latency_s * NS)
+    return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=known))
+
+
+def left_jacobian_inverse(theta: Floats) -> Floats:
+    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
+    factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
+
+
+def right_jacobian(theta: Floats) -> Floats:
+    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
+    two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
+
+
+class AttitudeFix:
+    """Data: nav_R_sensor (9), body_R_sensor (9), sigma (3) rad nav axes. `extra`: A turns the sensor in its mount."""
+
+    width = 21
+
+    def __init__(self, extra: tuple[str, ...]) -> None:
+        self.extra = extra
+
+    def observe(
+        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
+    ) -> tuple[Floats, Floats, list[Floats]]:
+        """See `observation.Observation`."""
+        fix, mount = data[:, :9].reshape(-1, 3, 3), data[:, 9:18].reshape(-1, 3, 3)
+        weight = 1.0 / data[:, 18:21, None]
+        foretold = R @ mount @ (exp(extra[0]) if extra else np.eye(3))
+        theta = Rotation.from_matrix(foretold @ fix.transpose(0, 2, 1)).as_rotvec()
+        by_turn = weight * left_jacobian_inverse(theta)
+        by_state = np.zeros((len(R), 3, 9))
+        by_state[:, :, :3] = by_turn @ R
+        return theta * weight[:, :, 0], by_state, [by_turn @ foretold @ right_jacobian(x) for x in extra]
+
+
+@cache
+def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
+    """The one row model of each kind of row; where : ``keyframe``, or ``instant`` for a later time."""
+    observation = AttitudeFix(extra)
+    if not timed and where == "keyframe":
+        return AtKeyframe(observation)
+    return AtInstant(observation, timed=timed, short=where == "keyframe")
+
+
+@dataclass
+class AttitudeBuilder:
+    """Adds the attitude of every pose fix that has one, beside its position.
+
+    attitude (n, 3, 3) nav_R_sensor, known (n,) which rows have one, mount (3, 3) body_R_sensor, sigma (n, 3) rad nav
+    axes; `own_sigma` (n,) marks rows whose sigma came with the data; mount_sigma rad, zero for a mount that is known
+    """
+
+    attitude: Floats
+    known: NDArray[np.bool_]
+    mount: Floats
+    sigma: Floats
+    own_sigma: NDArray[np.bool_]
+    mount_sigma: float
+    config: PoseFixConfig
+    gravity: float
+    name: str = ATTITUDE
+    stage: int = 0
+
+    @property
+    def gate_probability(self) -> float | None:
+        """Share of good rows inside the gate that outliers fail; None where none are looked for."""
+        return self.config.gate_probability if self.config.loss == "gate" else None
+
+    def _states(self, memory: Memory) -> dict[str, SessionState]:
+        """Session states in use, by letter."""
+        if memory.stage < LAST_STAGE:
+            return {}
+        found = {}
+        if self.config.time_offset_sigma > 0:
+            found["T"] = clock_state(NAME, self.config.time_offset_sigma)
+        if self.mount_sigma > 0:
+            turn = np.full(3, self.mount_sigma)
+            found["A"] = SessionState("A", NAME, f"{NAME}_mount_correction_rad", np.zeros(3), turn)
+        return found
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """A row for every attitude that became known in the window."""
+        states = self._states(memory)
+        for row in window.rows.get(NAME, ()):
+            if self.known[row]:
+                partial = self._here(step, window) if "T" in states else None
+                self._add_row(step, int(row), memory, states, step.index, partial)
+        for late in window.late.get(NAME, ()):
+            if self.known[late.row]:
+                assert previous is not None
+                partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
+                self._add_row(step, late.row, memory, states, late.window.index - 1, partial)
+
+    def _here(self, step: Step, window: Window) -> Partial:
+        """The instant of the keyframe itself; only its rate matters to an attitude."""
+        rate = window.gyro[-1] if len(window.dt) else step.bias.gyroscope()
+        return here(step.bias, np.zeros(3), rate, self.gravity)
+
+    def _add_row(
+        self,
+        step: Step,
+        row: int,
+        memory: Memory,
+        states: Mapping[str, SessionState],
+        index: int,
+        partial: Partial | None,
+    ) -> None:
+        where = "keyframe" if index == step.index else "instant"
+        keys = [key("X", index), key("V", index)]
+        if where == "instant":
+            keys.append(key("B", index))
+        keys += [step.use(states[letter]) for letter in "TA" if letter in states]
+        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
+        data = np.concatenate([self.attitude[row].ravel(), self.mount.ravel(), sigma])
+        if partial is not None:
+            data = np.concatenate([data, partial.columns()])
+        used = not (memory.is_rejected(self.name, row) or memory.is_rejected(NAME, row))
+        model = model_of(("A",) * ("A" in states), "T" in states, where)
+        loss = self._loss(memory)
+        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, (row,), (used,), loss))
+
+    def _loss(self, memory: Memory) -> str:
+        """Loss in the phase at hand; see `Memory`."""
+        if self.config.loss != "gate":
+            return self.config.loss
+        return {"robust": "cauchy", "causal": "huber"}.get(memory.phase, "none")
+
+
+def build(context: FactorContext) -> PositionBuilder | None:
+    """The builder of the positions of a session's pose fixes."""
+    stream, config = context.session.pose_fixes, context.config.pose_fixes
+    if stream is None:
+        return None
+    stated = NAME in context.session.sensors
+    options = GnssConfig(
+        loss=config.loss,
+        gate_probability=config.gate_probability,
+        correlated=False,
+        time_offset_sigma=config.time_offset_sigma,
+        lever_arm_sigma=0.0 if stated else config.lever_arm_sigma,
+    )
+    sigma = context.calibration.pose_fix_noise.position_sigma
+    return PositionBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+
+
+def build_attitude(context: FactorContext) -> AttitudeBuilder | None:
+    """The builder of the attitudes of a session's pose fixes."""
+    stream, config = context.session.pose_fixes, context.config.pose_fixes
+    if stream is None or stream.quat is None or not config.attitude:
+        return None
+    attitude, known = attitudes(stream)
+    given = np.full((len(stream), 3), np.nan) if stream.sigma_rot is None else stream.sigma_rot
+    sigma = np.where(np.isfinite(given), given, context.calibration.pose_fix_noise.attitude_sigma)
+    stated = NAME in context.session.sensors
+    return AttitudeBuilder(
+        attitude=attitude,
+        known=known,
+        mount=np.asarray(context.session.mount(NAME).body_R, dtype=np.float64),
+        sigma=sigma,
+        own_sigma=np.asarray(np.isfinite(given).all(axis=1)),
+        mount_sigma=0.0 if stated else float(np.radians(config.mount_sigma_deg)),
+        config=config,
+        gravity=context.session.gravity,
+    )
+
+
+def attitudes(stream: PoseFix) -> tuple[Floats, NDArray[np.bool_]]:
+    """nav_R_sensor (n, 3, 3) of the rows, and which (n,) have one.
+
+    Raises
+    ------
+    SessionError
+        A quaternion is not of unit norm.
+    """
+    rows = np.full((len(stream), 4), np.nan) if stream.quat is None else np.asarray(stream.quat)
+    known = np.isfinite(rows).all(axis=1)
+    norm = np.linalg.norm(rows, axis=1)
+    bad = np.flatnonzero(known & ~(np.abs(norm - 1.0) < 1e-2))
+    if len(bad):
+        row = int(bad[0])
+        raise SessionError(
+            NAME, f"quaternion norm {norm[row]:.6g} at row {row}", "1 within 0.01", "check the columns", row=row
+        )
+    xyzw = np.where(known[:, None], rows, np.array([1.0, 0.0, 0.0, 0.0]))[:, [1, 2, 3, 0]]
+    return np.asarray(Rotation.from_quat(xyzw).as_matrix()), known
