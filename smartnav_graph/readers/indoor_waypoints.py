@@ -8,6 +8,9 @@ A waypoint is a place that the walker tapped on the map: `LABEL_SIGMA`. The floo
 one height, which is zero here: `HEIGHT_SIGMA`. The first waypoint is tapped a moment before the sensors start;
 waypoints outside the inertial span by at most `EDGE_S` stand at its first or last sample, counted in
 `Session.dropped`.
+
+The recorder polls: all sensors share its stamps, and a reading is up to one period old. That is noise where the phone
+shakes, and the calibration that comes with the session says so (`polled_noise`).
 """
 
 from __future__ import annotations
@@ -19,10 +22,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, ImuNoise
 from smartnav_graph.errors import SessionError
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_bytes
 from smartnav_graph.session import Device, Session
+from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import NS
 
 NAME = "indoor-waypoints"
@@ -54,6 +59,8 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         device=Device(name=_phone(path), forward="+y", up="+z", vehicle="foot"),
         clock_epoch="unix",
     )
+    noise = polled_noise(session.require_imu())
+    session = replace(session, calibration=Calibration(device=session.device.name, imu_noise=noise))
     if not moved:
         return session
     counts = dict(session.dropped.get("control", {}))
@@ -112,6 +119,24 @@ def _imu(path: Path, tables: dict[str, TextTable]) -> Columns:
         )
     columns = vector_columns("accel_{}_m_s2", _vectors(accel))
     return {"t_ns": t_ns} | columns | vector_columns("gyro_{}_rad_s", _vectors(gyro))
+
+
+def polled_noise(imu: Imu) -> ImuNoise:
+    """Class noise and that of readings of any age up to one period h.
+
+    Linear between samples, a reading is off by (age / h - 1/2) of its step d to the next: sigma = rms(d) / sqrt(12) a
+    sample, density = sigma sqrt(h).
+    """
+    usual, period = DEVICE_CLASSES["mems"], float(np.median(np.diff(imu.t_ns))) / NS
+
+    def density(rows: NDArray[np.float64]) -> float:
+        return float(np.sqrt((np.diff(rows, axis=0) ** 2).mean() / 12.0 * period))
+
+    return replace(
+        usual,
+        accel_noise_density=float(np.hypot(usual.accel_noise_density, density(imu.accel))),
+        gyro_noise_density=float(np.hypot(usual.gyro_noise_density, density(imu.gyro))),
+    )
 
 
 def _control(path: Path, table: TextTable, imu_ns: NDArray[np.int64]) -> tuple[Columns, int]:

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from smartnav_graph import readers
+from smartnav_graph.calibration.model import DEVICE_CLASSES
 from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.indoor_waypoints import polled_noise
+from smartnav_graph.streams import Imu
 
 HEADING = """#\tstartTime:1574668577059
 #\tSiteID:5dd3\tSiteName:\u897f\u6eaa\tFloorId:5dd4\tFloorName:B1
@@ -52,6 +55,19 @@ def test_labels_say_how_good_they_are(trace):
     sigma = readers.read(trace()).control.sigma
     assert (sigma[:, :2] >= 0.5).all() and (sigma[:, :2] <= 1.0).all()  # m
     assert (sigma[:, 2] <= 0.3).all()  # a floor is flat
+
+
+def test_readings_of_any_age_are_noisy_where_the_phone_shakes(trace):
+    """A triangle wave read at random ages within the period: its error about the samples' mean age is the noise."""
+    rng, h, n = np.random.default_rng(0), 0.02, 20_000
+    wave = np.where(np.arange(n) % 2, 1.0, -1.0)  # rad/s; between samples the rate rises or falls by 2
+    late = wave[:-1] + rng.random(n - 1) * np.diff(wave)
+    error = late - 0.5 * (wave[1:] + wave[:-1])
+    imu = Imu(t_ns=np.arange(n) * 20_000_000, gyro=np.tile(wave, (3, 1)).T, accel=np.zeros((n, 3)))
+    noise = polled_noise(imu)
+    assert noise.gyro_noise_density == pytest.approx(error.std() * np.sqrt(h), rel=0.02)
+    assert noise.accel_noise_density == DEVICE_CLASSES["mems"].accel_noise_density  # at rest that of the class
+    assert readers.read(trace()).calibration.imu_noise.gyro_noise_density > 0.01  # two samples that leap
 
 
 def test_a_waypoint_just_before_the_sensors_is_used_and_told(trace):
