@@ -20,6 +20,7 @@ from scipy.stats import chi2
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
+from smartnav_graph.row_noise import row_scales
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.variance import noise_scales
 
@@ -189,6 +190,7 @@ def _inertial(
     if memory.stage < LAST_STAGE:
         scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}
         return replace(new, noise_scales={**new.noise_scales, **scales}), True
+    scales |= row_scales(builders, estimate, memory)
     change = [abs(np.log(scale / memory.scale(name))) for name, scale in scales.items()]
     return replace(new, noise_scales={**new.noise_scales, **scales}), max(change, default=0.0) < STEADY_INERTIAL
 

@@ -17,6 +17,7 @@ from smartnav_graph.graph import Memory
 from smartnav_graph.initialise import Initial
 from smartnav_graph.problem import Problem
 from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
 from smartnav_graph.variance import NOISE_NAMES
@@ -166,7 +167,7 @@ def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, d
             "sigma": spread[0] if alone else spread,
             "held": state.held,
         }
-    found |= _inertial_noise(problem, memory)
+    found |= _inertial_noise(problem, memory) | _row_noise(problem, memory)
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             found[f"{builder.name}_wander_sigma_m"] = {
@@ -196,6 +197,19 @@ def _inertial_noise(problem: Problem, memory: Memory) -> dict[str, dict[str, Any
             "held": group not in memory.noise_scales,
         }
         for group, name in NOISE_NAMES.items()
+    }
+
+
+def _row_noise(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
+    """Sigmas of the constraints' rows."""
+    groups = [item for builder in problem.builders for item in noise_groups(builder).items()]
+    return {
+        f"{group}_sigma": {
+            "value": float(f"{sigma * memory.scale(group):.4g}"),
+            "sigma": None,
+            "held": group not in memory.noise_scales,
+        }
+        for group, sigma in groups
     }
 
 

@@ -14,7 +14,7 @@ ORDER = (
     *("readers", "simulation", "vision"),
     *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "graduated", "consensus", "initialise", "config"),
-    *("withhold", "problem", "variance", "revise", "assemble", "summary", "estimate"),
+    *("withhold", "problem", "variance", "row_noise", "revise", "assemble", "summary", "estimate"),
     *("evaluation", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )
 DOOR = "__init__"  # it alone may look everywhere

@@ -188,10 +188,11 @@ class VehicleBuilder:
     config: VehicleConfig = VehicleConfig()
     name: str = "vehicle"
     stage: int = 1
-    noise_groups: tuple[str, ...] = ("vehicle_lateral", "vehicle_vertical")
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
+        noise = self.noise
+        self.noise_groups = {"vehicle_lateral": noise.lateral_sigma, "vehicle_vertical": noise.vertical_sigma}
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where one is due."""
@@ -199,8 +200,7 @@ class VehicleBuilder:
             return
         rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
         force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
-        scales = [memory.scale(group) for group in self.noise_groups]
-        sigma = np.array([self.noise.lateral_sigma, self.noise.vertical_sigma]) * scales
+        sigma = [known * memory.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
         keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.config)))
         step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))

@@ -113,7 +113,7 @@ class WheelBuilder:
     def __post_init__(self) -> None:
         self.model = AtKeyframe(RearWheels(self.body_R_vehicle))
         self._unsigned = bool((self.stream.speed >= 0).all())
-        self.noise_groups = (self.name,) if self.stream.sigma is None else ()
+        self.noise_groups = {self.name: self.default_sigma} if self.stream.sigma is None else {}
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where one is due."""
