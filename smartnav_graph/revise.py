@@ -116,7 +116,8 @@ def verdicts(
 
 
 def _position_verdict(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Verdict:
-    square = ((found.residual / builder.scaled_sigma(memory)[found.rows]) ** 2).sum(axis=1)
+    sigma = np.maximum(builder.scaled_sigma(memory)[found.rows], builder.least_gate_sigma)
+    square = ((found.residual / sigma) ** 2).sum(axis=1)
 
     def gate(square: Floats, level: float, probability: float | None) -> NDArray[np.bool_]:
         return builder.gate(square, level, found.rows, probability)

@@ -122,7 +122,8 @@ class PositionBuilder:
     """Adds one position factor a fix.
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
-    came with the data and is never scaled.
+    came with the data and is never scaled. Rows are judged by `least_gate_sigma` m at least when outliers are looked
+    for.
     """
 
     name: str
@@ -133,6 +134,7 @@ class PositionBuilder:
     config: GnssConfig = field(default_factory=GnssConfig)
     noise: GnssNoise = field(default_factory=GnssNoise)
     gravity: float = STANDARD_GRAVITY
+    least_gate_sigma: float = 0.0
     stage: int = 0
 
     def __post_init__(self) -> None:
