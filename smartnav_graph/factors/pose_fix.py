@@ -33,6 +33,9 @@ Floats = NDArray[np.float64]
 
 NAME = "pose_fixes"
 ATTITUDE = "pose_attitude"
+# Where inertial data and fixes of millimetres differ by centimetres the inertial data are wrong: rows are judged by
+# this sigma, m, at least when outliers are looked for.
+LEAST_GATE_SIGMA = 0.05
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,8 @@ def build(context: FactorContext) -> PositionBuilder | None:
         lever_arm_sigma=0.0 if stated else config.lever_arm_sigma,
     )
     sigma = context.calibration.pose_fix_noise.position_sigma
-    return PositionBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+    builder = PositionBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+    return replace(builder, least_gate_sigma=LEAST_GATE_SIGMA)
 
 
 def build_attitude(context: FactorContext) -> AttitudeBuilder | None:
