@@ -1,11 +1,12 @@
 """Gravity holds tilt where nothing else does: over some seconds the mean specific force points up.
 
-    r = [nav_R_body (f - b_a)]_(east, north) / sigma
+    r = [nav_R_body (f - b_a)]_(east, north) / sigma        and        r = nav_v_body / speed
 
 f is the mean of the specific force over a stretch, turned by the gyro to its end: what is left of it beside gravity is
-the change of velocity over the stretch divided by its length, small for whoever does not travel away. Its sigma grows
-with the motion: a share of the scatter of the force does not average out, and a mean that is longer or shorter than
-gravity tells a lasting acceleration.
+the change of velocity over the stretch divided by its length. Its sigma grows with the motion: who moves may turn round
+in a stretch, a share of the scatter of the force does not average out, and a mean whose size is not that of gravity
+tells a lasting acceleration. And whoever is carried by hand stays as slow as a walker, which keeps the velocity that
+nothing else holds from running away.
 
 The inertial factors use the same force; they say nothing of tilt unless velocity or position is held, and their noise
 is far below this sigma.
@@ -18,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +27,7 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.magnetometer import turned_mean
 from smartnav_graph.factors.observation import AtKeyframe, skew, turned
-from smartnav_graph.graph import Block, Memory, State, Step, Window, key
+from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 Floats = NDArray[np.float64]
@@ -37,20 +39,22 @@ WHEELED = ("car", "trolley")
 
 @dataclass(frozen=True)
 class GravityConfig:
-    """enabled : ``auto`` (where no position or velocity has come for `alone_s`, on foot or by hand), ``on``, ``off``;
-    stretch_s : over which the force is averaged; least_sigma m/s^2 : of a device at rest; share : of the scatter of the
-    force (m/s^2) that does not average out over a stretch."""
+    """enabled : ``auto`` (by hand, where no position, velocity or rest has come for `alone_s`), ``on``, ``off``;
+    stretch_s : over which the force is averaged; least_sigma m/s^2 : of a device at rest; speed m/s : of whoever moves,
+    along one axis, climb m/s : upwards; share : of the scatter of the force that does not average out."""
 
     enabled: str = "auto"
     alone_s: float = 60.0
     stretch_s: float = 4.0
     least_sigma: float = 0.05
+    speed: float = 1.4
+    climb: float = 0.5
     share: float = 0.1
 
     def __post_init__(self) -> None:
         if self.enabled not in ("auto", "on", "off"):
             raise ConfigError("config [gravity]", f"enabled = {self.enabled!r}", "auto, on or off")
-        if not min(self.stretch_s, self.least_sigma, self.share, self.alone_s) > 0:
+        if not min(self.stretch_s, self.least_sigma, self.speed, self.climb, self.share, self.alone_s) > 0:
             raise ConfigError("config [gravity]", "a length, sigma or share <= 0", "> 0")
 
 
@@ -131,9 +135,11 @@ class GravityBuilder:
         if not self._alone(window.t1_ns):
             return
         mean = done.force / done.length_s
-        data = np.append(mean, self.sigma(mean - step.bias.accelerometer(), done.scatter))[None]
+        data = np.append(mean, self.sigma(mean - step.bias.accelerometer(), done.scatter, done.length_s))[None]
         keys = [(key("X", step.index), key("V", step.index), key("B", step.index))]
         step.blocks.append(Block(self.name, MODEL, keys, data, step.t_ns, loss="huber"))
+        pace = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.config.speed, self.config.speed, self.config.climb]))
+        step.add(Tag("pace", step.t_ns), gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), pace))
 
     def _alone(self, t_ns: int) -> bool:
         if self.config.enabled == "on" or not len(self.held_ns):
@@ -142,19 +148,22 @@ class GravityBuilder:
         since = self._begin_ns if before == 0 else int(self.held_ns[before - 1])
         return t_ns - since > self.config.alone_s * NS
 
-    def sigma(self, mean: Floats, scatter: float) -> float:
-        """Sigma (m/s^2) of a mean force (3,) less bias whose size scattered by `scatter` m/s^2.
+    def sigma(self, mean: Floats, scatter: float, length_s: float) -> float:
+        """Sigma (m/s^2) of a mean force (3,) less bias, over `length_s` s, whose size scattered by `scatter` m/s^2.
 
         A force longer than gravity, sqrt(g^2 + a^2), tells an acceleration a; one off by a small e may as well be bias.
         """
-        size = float(np.linalg.norm(mean))
-        excess = max(abs(size - self.gravity) - BIAS_SLACK, 0.0)
-        lasting = np.sqrt(2.0 * self.gravity * excess)
-        return float(np.sqrt(self.config.least_sigma**2 + (self.config.share * scatter) ** 2 + lasting**2))
+        excess = max(abs(float(np.linalg.norm(mean)) - self.gravity) - BIAS_SLACK, 0.0)
+        parts = [self.config.least_sigma, self.config.share * scatter, np.sqrt(2.0 * self.gravity * excess)]
+        if scatter > REST_SCATTER:
+            parts.append(np.sqrt(2.0) * self.config.speed / length_s)
+        return float(np.linalg.norm(parts))
 
 
 # Size of the mean force (m/s^2) that an accelerometer bias may be off by without telling an acceleration.
 BIAS_SLACK = 0.2
+# Scatter of the force's size (m/s^2) that a sensor at rest may have.
+REST_SCATTER = 0.1
 
 
 def build(context: FactorContext) -> GravityBuilder | None:
@@ -163,5 +172,7 @@ def build(context: FactorContext) -> GravityBuilder | None:
     if config.enabled == "off" or (config.enabled == "auto" and (context.vehicle in WHEELED or context.on_foot)):
         return None
     stamps = [stream.t_ns for name, stream in context.session.streams().items() if name in HOLDS_TILT]
+    if context.rests is not None:  # from a rest on the gyro holds it for a while
+        stamps.append(np.array(context.rests.rests(), dtype=np.int64).ravel())
     held_ns = np.sort(np.concatenate([np.zeros(0, np.int64), *stamps]))
     return GravityBuilder(context.session.gravity, held_ns, config)
