@@ -20,6 +20,7 @@ from smartnav_graph.smoothers.estimate import (
     eliminated,
     indeterminate,
     posterior,
+    session_states,
     session_values,
     state_at,
     states_of,
@@ -104,11 +105,18 @@ class Batch:
         new = step.values()
         self.values.insert(new)
         self._recent.insert(new)
+        self._share(step, self._recent)
         since = step.t_s - self.steps[self._settled].t_s
         if since >= self._stretch_s:
             begin = time.perf_counter()
             self._settle(since)
             self._settle_s += time.perf_counter() - begin
+
+    def _share(self, step: Step, values: Any) -> None:
+        """Give `values` the present session states of a step, where it lacks them."""
+        for name in step.session:
+            if not values.exists(name):
+                values.insert(name, self.values.atVector(name))
 
     def _settle(self, since: float) -> None:
         """Solve the steps since the last settled one, held there by its marginals.
@@ -124,7 +132,7 @@ class Batch:
                 solve = min(solve, self._grown(stretch, since), key=lambda s: s.cost)
             if not growing:
                 graph = self._stretch_graph(stretch, since)
-                tree = _eliminate(graph.linearize(solve.values), chronological_order(stretch))
+                tree = _eliminate(graph.linearize(solve.values), self._order(stretch))
                 self._anchor = _anchor(tree, solve.values, stretch[-1])
                 self._settled = len(self.steps) - 1
         except (RuntimeError, SolverError):
@@ -155,8 +163,16 @@ class Batch:
             graph.native.push_back(_hold(self.steps[0]))
         return graph
 
+    def _order(self, stretch: Sequence[Step]) -> gtsam.Ordering:
+        """Keyframes of a stretch, then the session states that its factors touch: not those of its first step, which
+        the anchor stands for."""
+        order, touched = gtsam.Ordering(), stretch if stretch[0] is self.steps[0] else stretch[1:]
+        for name in [name for step in stretch for name in step.names()] + list(session_states(touched)):
+            order.push_back(name)
+        return order
+
     def _solve_stretch(self, stretch: Sequence[Step], values: Any, since: float) -> Solve:
-        graph, order = self._stretch_graph(stretch, since), chronological_order(stretch)
+        graph, order = self._stretch_graph(stretch, since), self._order(stretch)
         enough = 0.0 if self.unsure else GOOD_COST * len(stretch)
         return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate), enough)
 
@@ -170,6 +186,7 @@ class Batch:
             for step in part:
                 if not values.exists(key("X", step.index)):
                     copy_state(step, self._recent, values)
+                    self._share(step, values)
             known = 0 if solve is None else size // 2 - 1
             solve = self._solve_stretch(part, _shot(part[known:], values), since)
             values = solve.values
