@@ -102,13 +102,15 @@ class BarometerBuilder:
     loss: str
     name: str = "barometer"
     stage: int = 0
+    _start: float = 0.0
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """The bias at the keyframe, tied to the one before, and the mean height around the keyframe."""
         bias = key("D", window.index)
         measured = self._around(window)
-        foretold = float(step.predicted.position()[2])
-        step.chain[bias] = np.array([0.0 if measured is None else measured[0] - foretold])
+        if previous is None and measured is not None and step.predicted is not None:
+            self._start = measured[0] - float(step.predicted.position()[2])
+        step.chain[bias] = np.array([self._start])
         tag = Tag("barometer_bias", window.t1_ns)
         if previous is None:
             model = gtsam.noiseModel.Isotropic.Sigma(1, self.bias_sigma)
@@ -148,7 +150,7 @@ def build(context: FactorContext) -> BarometerBuilder | None:
     height, sigma = _heights(stream, context), UNKNOWN_HEIGHT
     if options.reference_hpa is not None:
         sigma = options.reference_sigma
-    scale = metres_a_hpa(float(np.median(stream.pressure_hpa)))
+    scale = metres_a_hpa(float(stream.pressure_hpa[0]))
     return BarometerBuilder(stream.t_ns, height, scale, sigma, context.calibration.barometer_noise, options.loss)
 
 
