@@ -6,6 +6,7 @@ error that wanders are states.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -31,8 +32,11 @@ LEAST_WANDERING_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
-# The same for a fix against its prediction: the clock and the noise are not settled yet, only gross faults count.
+# The same for a fix against its prediction, until so many have told how far predictions and fixes are apart: the clock
+# and the noise are not settled yet, only gross faults count.
 CAUSAL_TAIL = 9.0
+SETTLED = 10
+REMEMBERED = 30
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,7 @@ class PositionBuilder:
     gravity: float = STANDARD_GRAVITY
     least_gate_sigma: float = 0.0
     stage: int = 0
+    _squares: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
     def __post_init__(self) -> None:
         self.lever = np.broadcast_to(self.lever, self.position.shape)
@@ -180,8 +185,16 @@ class PositionBuilder:
             return "cauchy" if memory.phase == "robust" else "none"
         foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever[row]
         wander = wander_sigma(self.noise) ** 2 if self.name in memory.correlated else 0.0
-        square = ((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum()
-        return "cauchy" if self.gate(np.array([square]), CAUSAL_TAIL, np.array([row]))[0] else "none"
+        square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum())
+        return "cauchy" if self._surprises(square, row) else "none"
+
+    def _surprises(self, square: float, row: int) -> bool:
+        """Whether a fix contradicts its prediction, by the normalised square of this one and of those before: an
+        outlier hardly moves their median, and a solution that went astray is not left alone for long."""
+        known = self._squares
+        level = float(np.median(known) / chi2(3).median()) if len(known) >= SETTLED else CAUSAL_TAIL
+        known.append(square)
+        return bool(self.gate(np.array([square]), level, np.array([row]))[0])
 
     def grows(self, memory: Memory) -> bool:
         """Whether there is more to these fixes once the trajectory is found: states of their own."""
