@@ -15,7 +15,7 @@ from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import Memory, State, Window, key
 from smartnav_graph.prediction import Kinematics, states_at
-from smartnav_graph.problem import Problem
+from smartnav_graph.problem import TOO_LATE, Problem
 from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.whole_graph import Stack, loss_weights
@@ -106,6 +106,7 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
         white = found.residual / found.sigma
         weight = np.where(used, _weights(builder, white), 0.0)
         parts.append((estimate.t_ns[found.keyframe], builder.name, white, weight, used))
+        parts += _of_late_rows(builder.name, problem, estimate)
     for sensor in sorted({block.sensor for block in estimate.blocks} - set(positions)):
         parts += [_of_stack(stack, estimate) for stack in estimate.stacks(sensor)]
     native: dict[str, tuple[list[int], list[Floats]]] = {}
@@ -127,6 +128,19 @@ def _of_stack(stack: Stack, estimate: Estimate) -> Part:
     t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys], dtype=np.int64)
     weight = np.where(stack.used, loss_weights((white**2).sum(axis=1), stack.loss)[0], 0.0)
     return t_ns, stack.blocks[0].sensor, white, weight, stack.used
+
+
+def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:
+    """Rows of a replay that have no keyframe of their own, at the time they speak of."""
+    stamps = {row.row: row.t_ns for window in problem.windows for row in window.late.get(sensor, ())}
+    parts: list[Part] = []
+    for stack in estimate.stacks(sensor) if stamps else ():
+        rows = np.array([row for block in stack.blocks for row in block.rows])
+        late = np.isin(rows, list(stamps))
+        _, _, white, weight, used = _of_stack(stack, estimate)
+        t_ns = np.array([stamps[row] for row in rows[late].tolist()], dtype=np.int64)
+        parts.append((t_ns, sensor, white[late], weight[late], used[late]))
+    return parts
 
 
 def _weights(builder: PositionBuilder, white: Floats) -> Floats:
@@ -199,7 +213,9 @@ def densify(problem: Problem, keyframes: Solution) -> Solution:
 
 def used_counts(problem: Problem, memory: Memory) -> Mapping[str, int]:
     """Rows of every absolute sensor that the solution rests on."""
-    counts = {
-        b.name: sum(len(w.rows.get(b.name, ())) for w in problem.windows) for b in position_builders(problem.builders)
-    }
-    return {name: count - len(memory.rejected.get(name, ())) for name, count in counts.items()}
+    counts = {}
+    for name in (builder.name for builder in position_builders(problem.builders)):
+        there = sum(len(w.rows.get(name, ())) + len(w.late.get(name, ())) for w in problem.windows)
+        unused = len(memory.rejected.get(name, ())) + problem.dropped.get(name, {}).get(TOO_LATE, 0)
+        counts[name] = there - unused
+    return counts

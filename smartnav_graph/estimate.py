@@ -29,7 +29,7 @@ from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.late import known_ns
-from smartnav_graph.problem import Problem, prepare, recut
+from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.revise import position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
@@ -353,7 +353,7 @@ def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:
     """The problem with the rows that came too late for the smoother."""
     streams = problem.session.streams()
     counts = {name: count for name, count in too_late.items() if count and name in streams}
-    return problem.with_dropped("older than the lag", counts)
+    return problem.with_dropped(TOO_LATE, counts)
 
 
 def _polished(

@@ -24,6 +24,10 @@ from smartnav_graph.timebase import NS, Gap, find_gaps
 from smartnav_graph.withhold import split
 
 
+# Why a row that replay was handed is not in its solution.
+TOO_LATE = "older than the lag"
+
+
 @dataclass(frozen=True)
 class Problem:
     """One estimation problem. `session` lacks the withheld rows; rows of a stream keep their numbers in it."""
@@ -133,7 +137,7 @@ def cut(
     merge = round(spacing.merge_s * NS)
     streams = {name: stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
     aiding = {name: stream.t_ns for name, stream in streams.items()}
-    epochs = [s.t_ns[~late.is_late(s, merge)] if causal else s.t_ns for s in streams.values()]
+    epochs = [late.known_ns(stream) if causal else stream.t_ns for stream in streams.values()]
     times = keyframe_times(span, epochs, gaps, spacing, standing)
     windows = make_windows(session.require_imu(), times, gaps, aiding, spacing, rests.spans())
     return late.arrange(windows, streams, merge) if causal else (windows, {})

@@ -87,9 +87,10 @@ def test_what_comes_later_changes_nothing_before(smoother):
 def test_a_recording_cut_off_is_the_beginning_of_the_whole(smoother):
     session, config = recorded(), configured(smoother, polish=False)
     whole, part = (sn.replay(session, config, end_s=end) for end in (None, 45.0))
-    assert len(part) == 46
-    assert np.array_equal(part.nav_t_body, whole.nav_t_body[:46])
-    assert np.array_equal(part.covariance, whole.covariance[:46])
+    assert part.seconds[-1] == 45.0 and len(part) >= 46
+    assert np.array_equal(part.t_ns, whole.t_ns[: len(part)])
+    assert np.array_equal(part.nav_t_body, whole.nav_t_body[: len(part)])
+    assert np.array_equal(part.covariance, whole.covariance[: len(part)])
 
 
 def test_the_causal_covariance_shrinks_where_fixes_come_and_holds_its_errors():
@@ -111,7 +112,7 @@ def test_an_interrupt_leaves_a_valid_partial_run(smoother, tmp_path):
     run = estimate.replay(session, configured(smoother), progress=interrupted)
     assert run.summary["mode"] == f"replay {smoother}, interrupted"
     assert len(run.causal) == len(run.solution) == run.summary["keyframes"] == 21
-    assert run.solution.seconds[-1] == 20.0 and np.isfinite(run.solution.covariance).all()
+    assert 18.0 < run.solution.seconds[-1] <= 20.0 and np.isfinite(run.solution.covariance).all()
     write_run(run, tmp_path / "run")
     stored = read_run(tmp_path / "run")
     assert len(stored.solution) == 21 and "interrupted" in stored.summary["mode"]
@@ -128,12 +129,12 @@ def test_an_interrupt_before_there_is_anything_goes_through():
 
 def test_a_heading_open_for_long_does_not_lengthen_the_delay():
     """Batch looks at a minute of this recording for its start; a replay may look at 30 s."""
-    session = sn.simulate("figure-eight-60s")
+    session = recorded(white_m=5.0)
     assert sn.run(session).summary["initialisation"]["stretch_s"] > 45.0
     config = configured("fixed-lag", polish=False)
     whole, part = (sn.run(session, config, causal=True, end_s=end) for end in (None, 40.0))
     assert whole.summary["delay_s"] <= 30.0
-    assert np.array_equal(part.causal.nav_t_body, whole.causal.nav_t_body[:41])
+    assert np.array_equal(part.causal.nav_t_body, whole.causal.nav_t_body[: len(part.causal)])
 
 
 def test_latency_and_delay_are_told():

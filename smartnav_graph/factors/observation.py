@@ -128,6 +128,8 @@ class Partial(NamedTuple):
 
 _AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 54, "bias": 6, "accel": 3, "gyro": 3, "gravity": 1, "offset": 1}
 WIDTH = sum(_AT.values())
+# No instant is told from its keyframe by less.
+SHORTEST_S = 1e-9
 # Bias steps (m/s^2, rad/s) of the numerical derivative of a partial preintegration: its second order is negligible.
 _BIAS_STEP = np.array([1e-3] * 3 + [1e-5] * 3)
 
@@ -149,45 +151,41 @@ def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Parti
     if not window.t0_ns <= t_ns <= window.t1_ns:
         raise ValueError(f"{t_ns} ns lies outside the window {window.t0_ns} to {window.t1_ns} ns")
     dt = _until(window.dt, (t_ns - window.t0_ns) / NS)
-    base = bias.vector()
+    last = max(len(dt) - 1, 0)
+    if not len(dt):
+        return here(bias, window.accel[last], window.gyro[last], gravity)
+    pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), bias)
+    for accel, gyro, step in zip(window.accel, window.gyro, dt.tolist(), strict=False):
+        pim.integrateMeasurement(accel, gyro, step)
+    dR, dp, dv = pim.deltaRij().matrix(), pim.deltaPij(), pim.deltaVij()
+    by_bias = _by_bias(pim, bias.vector())
+    length = float(dt.sum())
+    return Partial(length, dR, dp, dv, by_bias, bias.vector(), window.accel[last], window.gyro[last], gravity)
 
-    def deltas(vector: Floats) -> Any:
-        at = gtsam.imuBias.ConstantBias(vector[:3], vector[3:])
-        pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(gravity), at)
-        for accel, gyro, step in zip(window.accel, window.gyro, dt.tolist(), strict=False):
-            pim.integrateMeasurement(accel, gyro, step)
-        return pim
 
-    middle = deltas(base)
-    dR = middle.deltaRij().matrix()
+def _by_bias(pim: Any, base: Floats) -> Floats:
+    """Derivative (9, 6) of the deltas by the bias: central differences of GTSAM's own first-order correction, seen in
+    what a body at rest in the origin does without gravity."""
     by_bias = np.zeros((9, 6))
     for i, step in enumerate(_BIAS_STEP):
-        up, down = (deltas(base + sign * step * np.eye(6)[i]) for sign in (1.0, -1.0))
-        turn = Rotation.from_matrix(down.deltaRij().matrix().T @ up.deltaRij().matrix()).as_rotvec()
-        change = [turn, up.deltaPij() - down.deltaPij(), up.deltaVij() - down.deltaVij()]
+        up, down = (
+            pim.predict(gtsam.NavState(), gtsam.imuBias.ConstantBias(moved[:3], moved[3:]))
+            for moved in (base + sign * step * np.eye(6)[i] for sign in (1.0, -1.0))
+        )
+        turn = gtsam.Rot3.Logmap(down.attitude().between(up.attitude()))
+        change = [turn, up.position() - down.position(), up.velocity() - down.velocity()]
         by_bias[:, i] = np.concatenate(change) / (2.0 * step)
-    last = max(len(dt) - 1, 0)
-    return Partial(
-        float(dt.sum()),
-        dR,
-        middle.deltaPij(),
-        middle.deltaVij(),
-        by_bias,
-        base,
-        window.accel[last],
-        window.gyro[last],
-        gravity,
-    )
+    return by_bias
 
 
 def _until(dt: Floats, length: float) -> Floats:
-    """The intervals up to `length` s, the last one cut."""
+    """The intervals up to `length` s, the last one cut; none where it is nothing."""
     ends = np.cumsum(dt)
-    count = int(np.searchsorted(ends, length - 1e-12)) + 1
+    count = int(np.searchsorted(ends, length - SHORTEST_S)) + 1
     part = dt[:count].copy()
     if len(part):
         part[-1] -= max(float(part.sum()) - length, 0.0)
-    return part
+    return part[part > 0.0] if length > SHORTEST_S else part[:0]
 
 
 class AtInstant:

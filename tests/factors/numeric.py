@@ -32,3 +32,30 @@ def assert_observation(observation: Observation, R, p, v, extra, data, *, step: 
     for i, (x, by) in enumerate(zip(extra, by_extra, strict=True)):
         found = derivative(3 + i, x.shape[1])
         np.testing.assert_allclose(by, found, atol=1e-6 * np.abs(found).max())
+
+
+def assert_jacobians(model, states, data, *, step: float = 1e-6, rtol: float = 1e-6) -> None:
+    """The Jacobians of a row model are the numerical ones on GTSAM's tangents, to `rtol` of the largest element."""
+    _, jacobians = model.linearize(states, data)
+    assert len(jacobians) == len(states) == len(model.letters)
+    for slot, (letter, jacobian) in enumerate(zip(model.letters, jacobians, strict=True)):
+        columns = []
+        for axis in range(jacobian.shape[2]):
+            ends = []
+            for size in (step, -step):
+                moved = list(states)
+                moved[slot] = _retracted(letter, states[slot], size * np.eye(jacobian.shape[2])[axis])
+                ends.append(model.linearize(moved, data)[0])
+            columns.append((ends[0] - ends[1]) / (2 * step))
+        numeric = np.stack(columns, axis=-1)
+        np.testing.assert_allclose(jacobian, numeric, atol=rtol * np.abs(numeric).max(), err_msg=letter)
+
+
+def _retracted(letter: str, states: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Poses (m, 4, 4) or vectors (m, n) moved on their tangent: R <- R Exp(w), p <- p + R u."""
+    if letter != "X":
+        return states + by
+    moved = states.copy()
+    moved[:, :3, :3] = states[:, :3, :3] @ exp(np.tile(by[:3], (len(states), 1)))
+    moved[:, :3, 3] += states[:, :3, :3] @ by[3:]
+    return moved
