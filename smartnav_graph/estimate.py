@@ -365,7 +365,8 @@ def _polished(
     """
     whole = recut(problem, known_ns)
     warm = estimate.values if whole is problem else carried_over(problem, estimate, whole.windows)
-    memory, total, told = initial.memory, 0, {}
+    memory, total = initial.memory, 0
+    told: dict[str, float] = {}
     while True:
         found, memory, passes = solve_passes(whole, whole.windows, initial.prior, memory, warm=warm, progress=progress)
         metres, degrees = distance(states_of(warm, found.indices), found.states())

@@ -1,8 +1,8 @@
 """Rows that become known after the time they speak of, in replay.
 
-A row with `arrival_ns` after its own stamp makes no keyframe at it, as nobody knew of it then, but one as it arrives. It
-is handed to the window that ends there, together with the window it speaks of. Batch knows everything and has no late
-rows.
+A row with `arrival_ns` after its own stamp makes no keyframe at that stamp, as nobody knew of it then, but one as it
+arrives. It is handed to the window that ends there, together with the window it speaks of. Batch knows everything and
+has no late rows.
 """
 
 from __future__ import annotations

@@ -87,8 +87,10 @@ class FixedLag(Incremental):
         kept = []
         for block in step.blocks:
             gone = [_oldest(keys) < oldest for keys in block.keys]
-            self.dropped[block.sensor] += sum(gone)
-            kept.append(_only(block, [not late for late in gone]) if any(gone) else block)
+            if any(gone):
+                self.dropped[block.sensor] += sum(gone)
+                block = _only(block, [not late for late in gone])
+            kept.append(block)
         step.blocks = kept
 
     def _make_room(self, step: Step) -> None:
