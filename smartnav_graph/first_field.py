@@ -39,11 +39,14 @@ BIAS, IRON, UP, FIELD = (slice(3 * i, 3 * i + 3) for i in range(4))
 
 @dataclass(frozen=True)
 class FieldStart:
-    """nav_R_body (3, 3) and gyro bias (3,) rad/s at the start, sigma of the heading rad; seconds looked at."""
+    """nav_R_body (3, 3) and gyro bias (3,) rad/s at the start, hard iron (3,) uT; sigma of the heading rad, and what it
+    is worth in hard iron, uT; seconds looked at."""
 
     nav_R_body: Floats
     gyro_bias: Floats
+    iron: Floats
     heading_sigma: float
+    iron_sigma: float
     length_s: float
 
 
@@ -154,12 +157,13 @@ def field_start(
     while True:
         found = fit(there.first(count), found.x, prior, sigma, noise)
         if count >= len(there.rate):
-            return _oriented(found, declination, count * GRID_S)
+            return _oriented(found, declination, np.linalg.inv(soft), count * GRID_S)
         count = min(2 * count, len(there.rate))
 
 
-def _oriented(found: Fit, declination: float, length_s: float) -> FieldStart | None:
-    """Attitude of the start whose up is G and whose horizontal part of B shows magnetic north."""
+def _oriented(found: Fit, declination: float, raw: Floats, length_s: float) -> FieldStart | None:
+    """Attitude of the start whose up is G and whose horizontal part of B shows magnetic north; `raw` (3, 3) undoes the
+    soft iron."""
     x, P = found.x, found.covariance
     size = np.linalg.norm(x[UP])
     up = x[UP] / size
@@ -175,4 +179,4 @@ def _oriented(found: Fit, declination: float, length_s: float) -> FieldStart | N
     magnetic_R_body = np.stack([east, north, up])
     c, s = np.cos(declination), np.sin(declination)
     nav_R_magnetic = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return FieldStart(nav_R_magnetic @ magnetic_R_body, x[BIAS], sigma, length_s)
+    return FieldStart(nav_R_magnetic @ magnetic_R_body, x[BIAS], raw @ x[IRON], sigma, sigma * strength, length_s)

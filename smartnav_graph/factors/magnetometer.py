@@ -18,7 +18,7 @@ errors, Sensors 11(12), on disturbances seen by intensity and dip.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +115,7 @@ class MagnetometerBuilder:
     """Adds one row a window: the mean of its samples.
 
     reading (n, 3) uT as recorded, t_ns (n,); field_ut (2,) horizontal and vertical strength with field_sigma (2,);
-    declination rad; iron_sigma uT
+    declination rad; iron_sigma uT; held_in_replay : the smoother of a replay keeps session states at their first values
     """
 
     t_ns: NDArray[np.int64]
@@ -128,12 +128,19 @@ class MagnetometerBuilder:
     config: MagnetometerConfig = field(default_factory=MagnetometerConfig)
     name: str = "magnetometer"
     stage: int = LAST_STAGE
+    held_in_replay: bool = False
 
     def __post_init__(self) -> None:
         self.soft_iron = np.reshape(self.noise.soft_iron, (3, 3))
         iron = np.asarray(self.noise.hard_iron_ut, dtype=np.float64)
         self.iron = SessionState("H", self.name, IRON, iron, np.full(3, self.iron_sigma))
         self.field = SessionState("F", self.name, STRENGTH, self.field_ut, self.field_sigma)
+        self.sure = self.iron_sigma
+
+    def begin(self, iron: Floats, sigma: float) -> None:
+        """Start from a hard iron (3,) uT that the first seconds tell to `sigma` uT. How sure it was beforehand stays
+        the sigma of its prior: the same samples are used again."""
+        self.iron, self.sure = replace(self.iron, initial=iron), min(sigma, self.iron_sigma)
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where it has samples and the gyro tells how they turned."""
@@ -165,14 +172,15 @@ class MagnetometerBuilder:
 
     def _usable(self, memory: Memory) -> bool:
         """A hard iron that is held although nobody knows it would pass for north."""
-        return self.iron.name not in memory.held or self.iron_sigma <= SURE_IRON_UT
+        held = self.iron.name in memory.held or (self.held_in_replay and memory.phase == "causal")
+        return not held or self.sure <= SURE_IRON_UT
 
     def disturbed(self, nav_R_body: Floats, y: Floats, A: Floats, sigma: float) -> bool:
         """Whether intensity and dip, as horizontal and vertical strength, contradict field and hard iron as they are
         known beforehand. Whatever the heading: it is the last thing to trust here."""
         level = nav_R_body @ (y - A @ self.iron.initial)
         found = np.array([np.hypot(level[0], level[1]), level[2]])
-        known = sigma**2 + self.field_sigma**2 + self.iron_sigma**2 + (TILT * np.linalg.norm(level)) ** 2
+        known = sigma**2 + self.field_sigma**2 + self.sure**2 + (TILT * np.linalg.norm(level)) ** 2
         return bool((np.abs(found - self.field_ut) > self.config.gate_sigmas * np.sqrt(known)).any())
 
 
@@ -206,6 +214,7 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
         noise,
         config,
         stage=LAST_STAGE if POSITIONS & set(context.session.streams()) else 0,
+        held_in_replay=context.config.replay.smoother == "isam2",
     )
 
 

@@ -183,6 +183,17 @@ def test_a_held_hard_iron_is_used_only_where_it_was_calibrated(sigma, used):
     assert block.used == (used,)
 
 
+def test_first_seconds_make_a_held_hard_iron_usable_and_leave_its_prior_as_wide_as_it_was():
+    made = builder(iron_sigma=240.0, held_in_replay=True, reading=np.tile(NAV_FIELD + IRON, (100, 1)))
+    causal = Memory(stage=1, phase="causal")
+    assert step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks[0].used == (False,)
+    made.begin(IRON, 2.0)
+    (block,) = step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks
+    assert block.used == (True,)
+    np.testing.assert_array_equal(made.iron.initial, IRON)
+    assert (made.iron.sigma == 240.0).all()
+
+
 def test_soft_iron_and_hard_iron_of_the_calibration_are_taken_out():
     soft = np.array([[1.1, 0.02, 0.0], [0.02, 0.9, 0.01], [0.0, 0.01, 1.05]])
     noise = MagnetometerNoise(hard_iron_ut=tuple(IRON), soft_iron=tuple(soft.ravel()), hard_iron_sigma_ut=1.0)
