@@ -159,12 +159,13 @@ def revise(
     if memory.phase == "gated":
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < STEADY for name in found)
-    new, inertial_steady = _inertial(builders, windows, estimate, memory, new)
-    steady = steady and inertial_steady
+    tuned, calm = _inertial(builders, windows, estimate, memory, new, _level(found, memory))
+    if memory.stage == LAST_STAGE:
+        new, steady = tuned, steady and calm
     if not (steady and new.rejected == memory.rejected):
         return new, False
-    grown = _grown(builders, estimate, new)
-    return grown, grown == new
+    grown = _grown(builders, estimate, tuned)
+    return grown, grown == tuned
 
 
 def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:
@@ -182,12 +183,30 @@ def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> M
     return replace(memory, held={**memory.held, **blind}, correlated=wandering)
 
 
+def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], memory: Memory) -> float:
+    """Normalised square of the fixes in use over their redundancy, at least 1."""
+    square = redundancy = 0.0
+    for name, (_, one) in found.items():
+        used = memory.used(name, one.rows)
+        square += float(one.square[used].sum())
+        redundancy += float(np.clip(1.0 - one.posterior[used] / one.sigma[used] ** 2, 0.0, 1.0).sum())
+    return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
+
+
 def _inertial(
-    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory, new: Memory
+    builders: Sequence[Builder],
+    windows: Sequence[Window],
+    estimate: Estimate,
+    memory: Memory,
+    new: Memory,
+    level: float,
 ) -> tuple[Memory, bool]:
     """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
-    residuals hold more than noise: what they say is an upper bound."""
-    scales = noise_scales(builders, windows, estimate, memory)
+    residuals hold more than noise: what they say is an upper bound. Beside fixes that wander it is a lower one: the
+    solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part."""
+    scales = noise_scales(builders, windows, estimate, memory, level)
+    if any(builder.wanders(memory) for builder in position_builders(builders)):
+        scales = {name: max(scale, 1.0) for name, scale in scales.items()}
     if memory.stage < LAST_STAGE:
         scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}
         return replace(new, noise_scales={**new.noise_scales, **scales}), True
