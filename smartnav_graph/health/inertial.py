@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 _MAX_RATE = 35.0  # rad/s = 2000 deg/s, where consumer gyroscopes saturate
 _MAX_RMS_RATE = 10.0  # rad/s; a phone shaken by hand reaches 5
 _FROZEN_S = 1.0  # six axes never repeat themselves for so long
-_CLEAR_TURN = 0.3  # rad in some seconds, in the mean
+_CLEAR_TURN = 0.4  # rad in some seconds
 _ALIKE = 0.7  # correlation that is no chance
 
 
@@ -162,17 +162,23 @@ def _gyro_course(facts: Facts) -> Iterator[Finding]:
     if turns is None:
         return
     course, gyro = turns
-    with np.errstate(invalid="ignore"):
-        alike = float(course @ gyro / np.sqrt((course @ course) * (gyro @ gyro)))
-    slope = float(course @ gyro / max(float(gyro @ gyro), 1e-12))
+    alike, slope = _fit(course, gyro, np.abs(gyro) > _CLEAR_TURN)
     if alike < -_ALIKE and 0.5 < -slope < 2.0:
         text = "gyro turns against the course of the fixes: its sign is wrong, or the fixes are mirrored"
         yield Finding("warning", "imu", text, "flip the sign of gyro, or exchange latitude and longitude of the fixes")
-    elif alike > _ALIKE and 30.0 < slope < 90.0:
-        text = (
-            f"the course of the fixes turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
-        )
+    alike, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
+    if alike > _ALIKE and 30.0 < slope < 90.0:
+        text = f"the fixes turn {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
         yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
+
+
+def _fit(course: Floats, gyro: Floats, clear: NDArray[np.bool_]) -> tuple[float, float]:
+    """Correlation of the clear turns, and how many times the course turns as fast; zeros where they are few."""
+    c, g = course[clear], gyro[clear]
+    power = float(g @ g)
+    if len(c) < JUDGED or not power > 0:
+        return 0.0, 0.0
+    return float(c @ g) / float(np.sqrt(power * (c @ c))), float(c @ g) / power
 
 
 def _turns(facts: Facts) -> tuple[Floats, Floats] | None:
@@ -189,8 +195,6 @@ def _turns(facts: Facts) -> tuple[Floats, Floats] | None:
     good = chords.clear & chords.clear[before] & chords.clear[after] & (np.abs(length - CHORD_S) < 0.3 * CHORD_S)
     course = np.arctan2(chords.velocity[:, 1], chords.velocity[:, 0])
     turn = np.asarray((course[after] - course[before] + np.pi) % (2 * np.pi) - np.pi)[good]
-    if len(turn) < JUDGED or float(turn @ turn) < _CLEAR_TURN**2 * JUDGED:
-        return None
     return turn, yaw[good] * length[good]
 
 

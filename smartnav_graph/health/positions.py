@@ -29,7 +29,7 @@ _FAR_M = 50_000.0  # two sensors of one session
 _FROZEN_FIXES_S = 10.0
 _HEIGHTS_M = (-500.0, 9000.0)  # of the Earth's land
 _GEOID_M = (8.0, 110.0)  # offsets of two heights that look like the geoid
-_ATTITUDE_PAIRS = 100
+_ATTITUDE_PAIRS, _LEAST_PAIRS, _ATTITUDE_PAIR_S = 100, 5, 15.0
 
 
 def _jumps(facts: Facts) -> Iterator[Finding]:
@@ -179,9 +179,9 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
         return
     quat = fixes.quat[np.isfinite(fixes.quat).all(axis=1)]
     t_ns = fixes.t_ns[np.isfinite(fixes.quat).all(axis=1)]
-    pairs = np.flatnonzero((np.diff(t_ns) > 0) & (np.diff(t_ns) < 5 * NS) & (t_ns[:-1] >= imu.t_ns[0]))
+    pairs = np.flatnonzero((np.diff(t_ns) > 0) & (np.diff(t_ns) < _ATTITUDE_PAIR_S * NS) & (t_ns[:-1] >= imu.t_ns[0]))
     pairs = pairs[t_ns[pairs + 1] <= imu.t_ns[-1]]
-    if len(pairs) < JUDGED:
+    if len(pairs) < _LEAST_PAIRS:
         return
     pairs = pairs[np.linspace(0, len(pairs) - 1, min(_ATTITUDE_PAIRS, len(pairs))).astype(int)]
     slow = thinned(imu)
@@ -194,11 +194,10 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
     off = {}
     for name, xyzw in readings.items():
         R = Rotation.from_quat(xyzw)
-        off[name] = float(
-            np.degrees(np.median(((R[pairs].inv() * R[pairs + 1]).inv() * Rotation.concatenate(turned)).magnitude()))
-        )
+        differs = (R[pairs].inv() * R[pairs + 1]).inv() * Rotation.concatenate(turned)
+        off[name] = float(np.degrees(np.quantile(differs.magnitude(), 0.75)))
     best = min(off, key=lambda name: off[name])
-    if best != "as they stand" and off["as they stand"] > 10.0 and off[best] < 0.25 * off["as they stand"]:
+    if best != "as they stand" and off["as they stand"] > 20.0 and off[best] < 0.25 * off["as they stand"]:
         text = f"attitudes turn {off['as they stand']:.0f} deg otherwise than gyro, {off[best]:.1f} deg if read {best}"
         yield Finding("warning", "pose_fixes", text, "give qw, qx, qy, qz of nav_R_body")
         return

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
 
 from smartnav_graph import frames
 from smartnav_graph.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats
@@ -21,6 +23,7 @@ _PRESSURE_HPA = (300.0, 1100.0)
 _WEATHER = 0.06  # share of the pressure
 _MAX_SPEED = 100.0  # m/s
 _FROZEN_FIELD_S = 10.0
+_ALIKE = 0.4  # correlation that is no chance
 _TURNS = 0.3  # rad/s, scatter of the rate of a device that is no rest
 
 
@@ -73,16 +76,32 @@ def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
             text = f"field points {found:+.0f} deg from the horizon, expected {there:+.0f}"
             yield Finding("warning", "magnetometer", f"{text}: its sign is wrong", "flip the sign of all axes")
             return
-    step = np.diff(t_ns) / NS
-    rate = interpolate(t_ns[:-1] + np.diff(t_ns) // 2, imu.t_ns, imu.gyro)
-    centred = field - field.mean(axis=0)
-    foretold = -np.cross(rate, 0.5 * (field[1:] + field[:-1])) * step[:, None]
-    change = np.diff(centred, axis=0)
+    yield from _field_turns(facts, t_ns, field)
+
+
+def _field_turns(facts: Facts, t_ns: NDArray[np.int64], field: Floats) -> Iterator[Finding]:
+    """Changes of the field over a second against those that gyro foretells, B(t + dt) = Exp(-w dt) B(t)."""
+    imu = facts.imu
+    assert imu is not None
+    every = max(1, round(NS / float(np.median(np.diff(t_ns)))))
+    field, t_ns = uniform_filter1d(field, every, axis=0)[::every], t_ns[::every]
+    length = (t_ns[1:] - t_ns[:-1]) / NS
+    whole = length < 2.0
+    if whole.sum() < JUDGED:
+        return
+    angle = np.cumsum(imu.gyro * np.diff(imu.t_ns, prepend=imu.t_ns[0])[:, None] / NS, axis=0)
+    turn = np.diff(interpolate(t_ns, imu.t_ns, angle), axis=0)[whole]
+    change = np.diff(field, axis=0)[whole]
+    foretold = Rotation.from_rotvec(-turn).apply(field[:-1][whole]) - field[:-1][whole]
     power = float((foretold**2).sum())
-    alike = float((change * foretold).sum() / np.sqrt(max(power * float((change**2).sum()), 1e-12)))
-    if alike < -0.5 and np.abs(rate).max() > 0.3:
+    slope = float((change * foretold).sum()) / max(power, 1e-12)
+    alike = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
+    if alike < -_ALIKE:
         text = "field turns against gyro: its axes are mirrored or exchanged, or gyro has the wrong sign"
         yield Finding("warning", "magnetometer", text, "give the field in body axes, right-handed")
+    elif alike > _ALIKE and 30.0 < slope < 90.0:
+        text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
+        yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
 
 
 def _pressure(facts: Facts) -> Iterator[Finding]:
