@@ -24,7 +24,9 @@ from smartnav_graph.errors import SolverError
 from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.magnetometer import MagnetometerBuilder
+from smartnav_graph.factors.pose_fix import AttitudeBuilder
 from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.first_attitude import LONGEST_S, AttitudeStart, attitude_start
 from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
@@ -38,6 +40,7 @@ from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
 from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.summary import summarise
+from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -196,9 +199,22 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         config=config,
         weak=problem.config.prior,
         standstill=problem.rests_at_start,
+        attitude_start=_oriented(problem, causal=longest_s is not None),
         **_north(problem),
     )
     return initialiser.run(solve, given)
+
+
+def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
+    """Attitude and gyro bias at the start by the first pose fixes that have an attitude."""
+    builder = next((b for b in problem.builders if isinstance(b, AttitudeBuilder)), None)
+    stream = problem.session.pose_fixes
+    if builder is None or stream is None:
+        return None
+    start, sigma = problem.windows[0].t1_ns, problem.calibration.imu_noise.gyro_bias_sigma
+    rows = builder.known & ((known_ns(stream) <= start + LONGEST_S * NS) if causal else True)
+    nav_R_body = builder.attitude[rows] @ builder.mount.T
+    return attitude_start(problem.session.require_imu(), start, stream.t_ns[rows], nav_R_body, sigma)
 
 
 def _north(problem: Problem) -> dict[str, Any]:

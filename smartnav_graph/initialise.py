@@ -22,6 +22,7 @@ from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.consensus import Agreed, Agreement, curve_of, distinct
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
+from smartnav_graph.first_attitude import AttitudeStart
 from smartnav_graph.first_field import FieldStart
 from smartnav_graph.first_seconds import Rest, find_rest, inertial_curve, kabsch_attitude
 from smartnav_graph.graph import Memory, State, Window
@@ -137,7 +138,7 @@ class Initialiser:
     sources : sensor and row of each fix; arrival_ns (m,) : when each became known, where that is later
     standstill : factors of their own say that a rest at the start does not move and does not turn
     iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
-    field_start : where north is by the first seconds, where they tell
+    field_start : where north is by the first seconds, where they tell; attitude_start : the attitude that fixes bring
     """
 
     windows: Sequence[Window]
@@ -155,6 +156,7 @@ class Initialiser:
     iron_sigma: float = 0.0
     magnetic_stage: int | None = None
     field_start: FieldStart | None = None
+    attitude_start: AttitudeStart | None = None
     sources: Sequence[tuple[str, int]] = ()
     arrival_ns: NDArray[np.int64] | None = None
 
@@ -366,7 +368,7 @@ class Initialiser:
         mean, sigma = np.zeros(6), np.array([self.noise.accel_bias_sigma] * 3 + [self.noise.gyro_bias_sigma] * 3)
         if rest is not None:
             mean[3:], sigma[3:] = rest.gyro, max(rest.gyro_sigma, LEAST_RATE_SIGMA)
-        at = starts[0].bias.vector() if before else mean
+        at = starts[0].bias.vector()
         curve = curve_of(windows, at, self.noise, sigma)
         rows = np.minimum(np.searchsorted(ends, t_ns), count - 1)
         problem = Agreement(curve.at(rows), fixes, (t_ns - ends[0]) / NS, self.fix_sigma, self.gravity, mean)
@@ -418,6 +420,9 @@ class Initialiser:
             starts.insert(0, self._state(self.field_start.nav_R_body, p0, v0, rest, self.field_start.gyro_bias))
         elif magnetic is not None:
             starts.insert(0, self._state(frames.nav_R_body_from_heading(magnetic[0], up, self.forward), p0, v0, rest))
+        if self.attitude_start is not None:
+            oriented = self.attitude_start
+            starts.insert(0, self._state(oriented.nav_R_body, p0, v0, rest, oriented.gyro_bias))
         course = np.degrees(np.arctan2(v0[0], v0[1])) if np.linalg.norm(v0[:2]) > 1.0 else 0.0
         for heading in course + np.arange(self.config.starts) * 360.0 / self.config.starts:
             R = frames.nav_R_body_from_heading(float(heading), up, self.forward)

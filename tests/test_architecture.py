@@ -10,12 +10,12 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 
 # From the ground up. A room is a module or a folder of modules.
 ORDER = (
-    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps"),
+    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps", "standstill"),
     *("readers", "simulation", "vision"),
     *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
-    *("first_seconds", "first_field", "graduated", "consensus", "initialise", "config"),
+    *("first_seconds", "first_field", "first_attitude", "graduated", "consensus", "initialise", "config"),
     *("withhold", "problem", "variance", "row_noise", "revise", "assemble", "summary", "estimate"),
-    *("evaluation", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
+    *("evaluation", "intervals", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )
 DOOR = "__init__"  # it alone may look everywhere
 HEAVY = {"rerun", "cv2", "pycolmap", "evo", "pandas", "matplotlib"}

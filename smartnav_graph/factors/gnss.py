@@ -254,6 +254,7 @@ class PositionBuilder:
         sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
         used = not memory.is_rejected(self.name, row)
         loss = self._loss_of(row, sigma, step, memory) if index == step.index else self._loss_late(memory)
+        sigma, loss = self._softened(sigma, loss)
         chain = self.name in memory.correlated
         if partial is None and not (states or chain):
             if used:
@@ -275,6 +276,10 @@ class PositionBuilder:
             data = np.concatenate([data, partial.columns()])
         model = model_of(extra, "T" in states, where)
         step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, (row,), (used,), loss))
+
+    def _softened(self, sigma: Floats, loss: str) -> tuple[Floats, str]:
+        """Sigma (3,) and loss of a row as they are used."""
+        return sigma, loss
 
     def _loss_late(self, memory: Memory) -> str:
         """Loss of a late fix in replay: no prediction of its own time is at hand to gate it with."""

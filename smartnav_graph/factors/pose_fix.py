@@ -121,6 +121,18 @@ def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
 
 
 @dataclass
+class PoseFixBuilder(PositionBuilder):
+    """`PositionBuilder` for fixes that may be far better than what inertial data foretell of them.
+
+    A redescending loss would believe the inertial data instead, for good: what it is asked for gets Huber's, with a
+    sigma of `LEAST_GATE_SIGMA` at least.
+    """
+
+    def _softened(self, sigma: Floats, loss: str) -> tuple[Floats, str]:
+        return (np.maximum(sigma, LEAST_GATE_SIGMA), "huber") if loss == "cauchy" else (sigma, loss)
+
+
+@dataclass
 class AttitudeBuilder:
     """Adds the attitude of every pose fix that has one, beside its position.
 
@@ -201,10 +213,10 @@ class AttitudeBuilder:
         """Loss in the phase at hand; see `Memory`."""
         if self.config.loss != "gate":
             return self.config.loss
-        return {"robust": "cauchy", "causal": "huber"}.get(memory.phase, "none")
+        return "huber" if memory.phase in ("robust", "causal") else "none"
 
 
-def build(context: FactorContext) -> PositionBuilder | None:
+def build(context: FactorContext) -> PoseFixBuilder | None:
     """The builder of the positions of a session's pose fixes."""
     stream, config = context.session.pose_fixes, context.config.pose_fixes
     if stream is None:
@@ -218,7 +230,8 @@ def build(context: FactorContext) -> PositionBuilder | None:
         lever_arm_sigma=0.0 if stated else config.lever_arm_sigma,
     )
     sigma = context.calibration.pose_fix_noise.position_sigma
-    builder = PositionBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+    builder = PoseFixBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+    assert isinstance(builder, PoseFixBuilder)
     return replace(builder, least_gate_sigma=LEAST_GATE_SIGMA)
 
 

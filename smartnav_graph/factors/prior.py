@@ -60,9 +60,12 @@ class PriorBuilder:
     stage: int = 0
 
     def placed(self) -> PriorBuilder:
-        """The same with a position sigma of 100 km where there is none, for a smoother that solves at the first
-        keyframe and cannot wait for the first fix."""
-        return self if self.sigma_pos is not None else replace(self, sigma_pos=np.full(3, UNKNOWN_PLACE))
+        """The same for a smoother that solves at the first keyframe and cannot wait for the first fix: a position sigma
+        of 100 km where there is none, and the bias found at the start as the mean of its wide prior where no rest gave
+        one."""
+        place = np.full(3, UNKNOWN_PLACE) if self.sigma_pos is None else self.sigma_pos
+        mean = self.start.bias if self.rest_end_ns is None else self.bias_mean
+        return replace(self, sigma_pos=place, bias_mean=mean)
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Prior factors and initial values of the first keyframe; later only zero velocity while the rest lasts."""
