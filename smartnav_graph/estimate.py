@@ -232,6 +232,8 @@ def _north(problem: Problem) -> dict[str, Any]:
         builder.iron_sigma,
         builder.declination,
     )
+    if start is not None:
+        builder.begin(start.iron, start.iron_sigma)
     return {
         "magnetometer": stream,
         "declination_deg": problem.session.declination_deg,
