@@ -53,8 +53,8 @@ class Writing(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimating(Writing):
-    """What `smooth` and `replay` have in common."""
+class Asking(Command):
+    """A session, and how to estimate on it."""
 
     session: SourceName
     """Session folder, or a log of a known format (see `smartnav formats`)."""
@@ -84,8 +84,9 @@ class Estimating(Writing):
         file = _value_of("--config", arguments)
         if file is None:
             return None
-        missing: Any = tyro.MISSING
-        return cls(session=missing, out=missing, options=config_model.load(file))
+        required = (f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING)
+        missing: dict[str, Any] = dict.fromkeys(required, tyro.MISSING)
+        return cls(**missing, options=config_model.load(file))
 
     def resolved(self) -> Config:
         """The configuration with the options over it."""
@@ -99,6 +100,11 @@ class Estimating(Writing):
             rate=self.rate,
         )
         return dataclasses.replace(self.options, run=dataclasses.replace(self.options.run, **asked))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimating(Asking, Writing):
+    """What `smooth` and `replay` have in common."""
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -1,0 +1,111 @@
+"""How far a solution strays between fixes, on the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from smartnav_graph import readers
+from smartnav_graph.cli.options import Asking, Switch, progress, repairs
+from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.intervals import FixesFromReference, Interval, intervals
+from smartnav_graph.readers.reference import load_reference
+from smartnav_graph.run_folder import plain
+from smartnav_graph.session import Session
+from smartnav_graph.streams import Reference
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervals(Asking):
+    """Replays the session with fixes every few seconds, and compares what was smoothed and what was foretold between
+    them with a reference: mean, 67 %, 95 % and RMS of the error.
+
+    smoothed: all data; causal: known at that time; causal_end: just before the next fix.
+
+    Example: smartnav intervals walk --every 1,2,5 --reference walk --fixes-from-reference --fix-sigma 0.005,0.5
+    """
+
+    every: Annotated[str, tyro.conf.arg(metavar="S,S,...")]
+    """Spacings of the fixes, seconds."""
+    reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """TUM, EuRoC ground truth, CSV with t, x, y, z named, or a session folder."""
+    fixes_from_reference: Switch = False
+    """Make the fixes of the reference, with noise, instead of thinning the session's own."""
+    fix_sigma: Annotated[str, tyro.conf.arg(metavar="M[,DEG]")] = "0.3,2"
+    """Sigma of these fixes on each axis: position m, attitude deg (without it they have no attitude)."""
+    latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.0
+    """How long after the time they speak of these fixes become known."""
+    seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """How many sets of these fixes, seeds 0 to N - 1."""
+    json: Switch = False
+    """Print JSON, and nothing else, on stdout."""
+
+    def run(self) -> None:
+        session = readers.load(self.session, repairs=repairs(self.repair))
+        reference = self._reference(session)
+        every = numbers("--every", self.every)
+        made = self._made() if self.fixes_from_reference else None
+        total = 3 * len(every) * (self.seeds if made else 1)
+        found: list[Interval] = []
+        with progress(self.quiet) as show:
+            for row in intervals(session, reference, every, made=made, seeds=self.seeds, config=self.resolved()):
+                found.append(row)
+                show("intervals", len(found), total)
+        print(json.dumps(plain([r.to_dict() for r in found]), allow_nan=False) if self.json else intervals_text(found))
+
+    def _reference(self, session: Session) -> Reference:
+        """The reference; where it is the log just read, what came with that."""
+        folder = Path(self.session)
+        if self.reference != folder or (folder / "reference.parquet").is_file():
+            return load_reference(self.reference)
+        if session.reference is None:
+            raise SessionError(
+                self.reference, "holds no reference", "a log with one, or a file", "give --reference FILE"
+            )
+        return session.reference
+
+    def _made(self) -> FixesFromReference:
+        if self.seeds < 1:
+            raise ConfigError("--seeds", str(self.seeds), ">= 1")
+        sigmas = numbers("--fix-sigma", self.fix_sigma)
+        if len(sigmas) > 2:
+            raise ConfigError("--fix-sigma", repr(self.fix_sigma), "metres, or metres and degrees, as 0.3,2")
+        return FixesFromReference(sigmas[0], sigmas[1] if len(sigmas) == 2 else None, self.latency)
+
+
+def numbers(option: str, text: str) -> list[float]:
+    """The numbers of a comma separated list.
+
+    Raises
+    ------
+    ConfigError
+        Not one number at least, or something else among them.
+    """
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not np.isfinite(found).all():
+        raise ConfigError(option, repr(text), "numbers separated by commas, as 1,2,5")
+    return found
+
+
+def intervals_text(found: Sequence[Interval]) -> str:
+    """A table for people: one line a spacing and kind, figures averaged over the seeds."""
+    names = ("mean_m", "p67_m", "p95_m", "rmse_m", "horizontal_mean_m")
+    heading = "".join(f"{name:>10}" for name in ("mean m", "67 % m", "95 % m", "RMS m", "mean 2-D"))
+    lines = [f"{'every s':>8} {'kind':<11}{'seeds':>6}{'rows':>8}{heading}"]
+    groups: dict[tuple[float, str], list[Interval]] = {}
+    for row in found:
+        groups.setdefault((row.every_s, row.kind), []).append(row)
+    for (every, kind), rows in groups.items():
+        figures = [float(np.mean([getattr(row, name) for row in rows])) for name in names]
+        told = "".join(f"{value:>10.4f}" for value in figures)
+        lines.append(f"{every:>8g} {kind:<11}{len(rows):>6}{sum(row.n for row in rows):>8}{told}")
+    return "\n".join(lines)
