@@ -126,7 +126,7 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
 def _of_stack(stack: Stack, estimate: Estimate) -> Part:
     white, _ = stack.linearize(estimate.values)
     t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys], dtype=np.int64)
-    weight = np.where(stack.used, loss_weights((white**2).sum(axis=1), stack.loss)[0], 0.0)
+    weight = np.where(stack.used, loss_weights((white**2).sum(axis=1), stack.loss, stack.reach)[0], 0.0)
     return t_ns, stack.blocks[0].sensor, white, weight, stack.used
 
 

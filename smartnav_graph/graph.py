@@ -178,7 +178,7 @@ class Block:
     """m rows of one `RowModel` at one time: keys (m, k), data (m, q). One pass in batch, CustomFactors in replay.
 
     rows : row of the stream behind each, -1 where there is none; used : False keeps a row out of the solve, its
-    residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row
+    residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row divided by `reach`
     """
 
     sensor: str
@@ -189,6 +189,7 @@ class Block:
     rows: Sequence[int] = ()
     used: Sequence[bool] = ()
     loss: str = "none"
+    reach: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.rows:

@@ -55,7 +55,7 @@ def _unexplained(stack: Stack, jacobians: list[Floats], estimate: Estimate) -> F
 
 def _scales(stack: Stack, groups: Iterable[str], estimate: Estimate, memory: Memory) -> dict[str, float]:
     white, jacobians = stack.linearize(estimate.values)
-    weight = loss_weights((white**2).sum(axis=1), stack.loss)[0] * stack.used
+    weight = loss_weights((white**2).sum(axis=1), stack.loss, stack.reach)[0] * stack.used
     left = _unexplained(stack, jacobians, estimate)
     found = {}
     for axis, group in enumerate(groups):

@@ -42,15 +42,19 @@ class Snapshot:
         return np.array([self._found[name] for name in names])
 
 
-def loss_weights(square: Floats, loss: str) -> tuple[Floats, Floats]:
-    """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1)."""
+def loss_weights(square: Floats, loss: str, reach: Floats | float = 1.0) -> tuple[Floats, Floats]:
+    """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1), for
+    norms in units of `reach` (m,)."""
     if loss == "none":
         return np.ones_like(square), 0.5 * square
+    scale = np.square(reach)
+    square = square / scale
     if loss == "cauchy":
-        return 1.0 / (1.0 + square), 0.5 * np.log1p(square)
+        return 1.0 / (1.0 + square), 0.5 * scale * np.log1p(square)
     norm = np.sqrt(np.maximum(square, 1e-300))
     outside = norm > HUBER
-    return np.where(outside, HUBER / norm, 1.0), np.where(outside, HUBER * norm - 0.5 * HUBER**2, 0.5 * square)
+    cost = np.where(outside, HUBER * norm - 0.5 * HUBER**2, 0.5 * square)
+    return np.where(outside, HUBER / norm, 1.0), scale * cost
 
 
 class Stack:
@@ -60,6 +64,7 @@ class Stack:
         self.model, self.blocks, self.held = model, blocks, held
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
+        self.reach = np.repeat([block.reach for block in blocks], [len(block.keys) for block in blocks])
         self.used = np.array([used for block in blocks for used in block.used], dtype=bool)
         self.data = np.concatenate([block.data for block in blocks])
 
@@ -75,12 +80,12 @@ class Stack:
     def cost(self, values: Any) -> float:
         """Half the sum of squares of the used rows, under the loss."""
         residual = self.linearize(values)[0][self.used]
-        return float(loss_weights((residual**2).sum(axis=1), self.loss)[1].sum())
+        return float(loss_weights((residual**2).sum(axis=1), self.loss, self.reach[self.used])[1].sum())
 
     def add_to(self, linear: Any, values: Any) -> None:
         """Append one linear factor a used row; held states and states that nothing depends on have no column."""
         residual, jacobians = self.linearize(values)
-        root = np.sqrt(loss_weights((residual**2).sum(axis=1), self.loss)[0])
+        root = np.sqrt(loss_weights((residual**2).sum(axis=1), self.loss, self.reach)[0])
         free = [i for i, jacobian in enumerate(jacobians) if self.keys[0][i] not in self.held and jacobian.any()]
         augmented = np.concatenate([*(jacobians[i] for i in free), -residual[:, :, None]], axis=2)
         augmented *= root[:, None, None]
@@ -165,14 +170,14 @@ def custom_factor(block: Block, row: int, held: Held) -> Any:
         return np.asarray(residual[0])
 
     dim = len(model.linearize([_zero(letter) for letter in model.letters], data)[0][0])
-    return gtsam.CustomFactor(_noise(dim, block.loss), [keys[i] for i in free], error)
+    return gtsam.CustomFactor(_noise(dim, block.loss, block.reach), [keys[i] for i in free], error)
 
 
-def _noise(dim: int, loss: str) -> Any:
+def _noise(dim: int, loss: str, reach: float) -> Any:
     unit, estimators = gtsam.noiseModel.Unit.Create(dim), gtsam.noiseModel.mEstimator
     if loss == "none":
         return unit
-    estimator = estimators.Huber.Create(HUBER) if loss == "huber" else estimators.Cauchy.Create(1.0)
+    estimator = estimators.Huber.Create(HUBER * reach) if loss == "huber" else estimators.Cauchy.Create(reach)
     return gtsam.noiseModel.Robust.Create(estimator, unit)
 
 
