@@ -24,6 +24,7 @@ from smartnav_graph.smoothers.estimate import (
     session_values,
     state_at,
     states_of,
+    undetermined,
 )
 from smartnav_graph.smoothers.minimise import COARSE, Solve, SolveConfig, minimise
 from smartnav_graph.smoothers.whole_graph import WholeGraph
@@ -55,6 +56,8 @@ GOOD_COST = 1.7
 GROW_FROM = 4
 # Position variance (m^2) beyond which nothing holds the trajectory; minutes of dead reckoning reach 1e14.
 LARGEST_VARIANCE = 1e18
+# Share of the first stretch that a later one is at least: a few fixes must lie in it.
+SHORTEST_STRETCH = 0.3
 # Turn (rad) that the gyro bias may add to a dead-reckoned guess.
 LARGEST_TURN = 0.1
 # Factor on the covariance that a settled stretch hands to the next: a linearised covariance is optimistic.
@@ -149,9 +152,8 @@ class Batch:
     def _next_stretch(self, tree: Any) -> float:
         """As long as the gyro bias is unlikely to turn the guess by more than `LARGEST_TURN`."""
         bias = np.diag(tree.marginalCovariance(key("B", self.steps[-1].index)))[3:]
-        return float(
-            np.clip(LARGEST_TURN / np.sqrt(bias.max()), 0.3 * self.config.settle_s, self.config.longest_settle_s)
-        )
+        shortest, longest = SHORTEST_STRETCH * self.config.settle_s, self.config.longest_settle_s
+        return float(np.clip(LARGEST_TURN / np.sqrt(bias.max()), shortest, longest))
 
     def _stretch_graph(self, stretch: Sequence[Step], since: float) -> WholeGraph:
         """Factors of a stretch, held at its beginning."""
@@ -307,10 +309,4 @@ def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None
     )
     if bad.any():
         step = steps[int(np.flatnonzero(bad)[0])]
-        sensors = ", ".join(sorted(step.sensors())) or "nothing"
-        raise SolverError(
-            f"t = {(step.t_ns - t0_ns) / 1e9:.2f} s",
-            f"position or attitude is not determined there (keyframe {step.index}, touched by {sensors})",
-            "an absolute measurement nearby",
-            "add position fixes, control points or standstills, or give --initial",
-        )
+        raise undetermined((step.t_ns - t0_ns) / 1e9, "position or attitude", step.index, step.sensors())

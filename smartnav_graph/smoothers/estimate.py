@@ -304,21 +304,28 @@ def to_nav_axes(joint: Floats, nav_R_body: Floats) -> Floats:
 
 
 _NEAR = re.compile(r"Symbol: (\w)(\d+)")
+_WHAT = {"X": "position or attitude", "V": "velocity", "B": "an inertial bias"}
 
 
-def indeterminate(error: Exception, t_ns: dict[int, int], t0_ns: int, touching: dict[int, set[str]]) -> SolverError:
+def indeterminate(
+    error: Exception, t_ns: Mapping[int, int], t0_ns: int, touching: Mapping[int, set[str]]
+) -> SolverError:
     """GTSAM's complaint about an under-determined state, in words: which, when, what touches it, what is missing."""
     text = str(error)
     found = _NEAR.search(text)
     if found is None:
         return SolverError("solve", text.strip().splitlines()[0] if text.strip() else "failed", "a solvable graph")
     letter, index = found[1].upper(), int(found[2])
-    names = {"X": "position or attitude", "V": "velocity", "B": "an inertial bias"}
     when = (t_ns[index] - t0_ns) / 1e9 if index in t_ns else float("nan")
-    sensors = ", ".join(sorted(touching.get(index, set()))) or "nothing"
+    return undetermined(when, _WHAT.get(letter, letter), index, touching.get(index, set()))
+
+
+def undetermined(t_s: float, what: str, index: int, sensors: Iterable[str]) -> SolverError:
+    """The fault of a keyframe that nothing holds."""
+    names = ", ".join(sorted(sensors)) or "nothing"
     return SolverError(
-        f"t = {when:.2f} s",
-        f"{names.get(letter, letter)} is not determined there (keyframe {index}, touched by {sensors})",
+        f"t = {t_s:.2f} s",
+        f"{what} is not determined there (keyframe {index}, touched by {names})",
         "an absolute measurement nearby",
         "add position fixes, control points or standstills, or give --initial",
     )
