@@ -30,9 +30,15 @@ from smartnav_graph.smoothers.estimate import Estimate
 Floats = NDArray[np.float64]
 
 # Redundancy below which a group teaches nothing.
-LEAST_REDUNDANCY = 10.0
+LEAST_REDUNDANCY = 4.0
 # Most that a sigma moves in one pass.
 MOST = 5.0
+# No device is a factor of more than this from what is known of its class.
+WIDEST = 10.0
+# Normalised square at which fixes contradict their sigma.
+CONTRADICTION = 1.5
+# The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.
+RELAXATION = 1.5
 # Groups of noise and their fields in `calibration.model.ImuNoise`.
 NOISE_NAMES = {
     "accel": "accel_noise_density",
@@ -49,10 +55,17 @@ class Component(NamedTuple):
     square: float
     redundancy: float
 
-    def scale(self, before: float, weight: float) -> float:
-        """The next scale of the group's sigma; `weight` is what the noise known before (scale 1) counts for."""
-        square = (before**2 * self.square + weight) / (self.redundancy + weight)
-        return float(np.clip(np.sqrt(square), before / MOST, before * MOST))
+    def scale(self, before: float, weight: float, level: float = 1.0) -> float:
+        """The next scale of the group's sigma.
+
+        weight : what the noise known before (scale 1) counts for; level : normalised square of the fixes. Where they
+        contradict their own sigma more than the group does, they bend the solution, and the noise is not to blame.
+        """
+        blamed = level < CONTRADICTION or self.square > level * self.redundancy
+        square = self.square if blamed else min(self.square, self.redundancy)
+        wanted = np.sqrt((before**2 * square + weight) / (self.redundancy + weight))
+        step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
+        return float(np.clip(before * step, 1.0 / WIDEST, WIDEST))
 
 
 class _Factors(NamedTuple):
@@ -126,14 +139,15 @@ def _walks(builder: ImuBuilder, windows: Sequence[Window], estimate: Estimate, m
 
 
 def noise_scales(
-    builders: Iterable[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory
+    builders: Iterable[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory, level: float = 1.0
 ) -> dict[str, float]:
-    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of."""
+    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of; `level` is the
+    normalised square of the fixes."""
     builder = next((b for b in builders if isinstance(b, ImuBuilder) and b.config.estimate_noise), None)
     if builder is None or len(windows) < 2:
         return {}
     return {
-        name: part.scale(memory.scale(name), builder.weight)
+        name: part.scale(memory.scale(name), builder.weight, level)
         for name, part in components(builder, windows, estimate, memory).items()
         if part.redundancy >= LEAST_REDUNDANCY
     }

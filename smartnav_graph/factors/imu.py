@@ -35,9 +35,9 @@ KEPT_BIAS = 0.1 * STALE_BIAS
 
 
 # What the noise known before counts beside residuals, in degrees of freedom: that of a class is right within a factor
-# of two or so (its logarithm has sigma 1 / sqrt(2 nu) = 0.5), that of a calibrated device within a sixth.
+# of two or so (its logarithm has sigma 1 / sqrt(2 nu) = 0.5), that of a calibrated device to 7 %.
 CLASS_WEIGHT = 2.0
-CALIBRATED_WEIGHT = 20.0
+CALIBRATED_WEIGHT = 100.0
 
 
 @dataclass(frozen=True)
