@@ -43,6 +43,8 @@ SOMEWHERE = (np.array([25.0, 0.0]), np.array([12.0, 45.0]))
 MODEL_SIGMA_UT = 2.0
 # Intensities (uT) that a reading without large hard iron can have: the Earth's field, give or take iron nearby.
 EARTHLY_UT = (20.0, 70.0)
+# Cauchy's constant that keeps 95 % efficiency on Gaussian residuals (Holland, Welsch 1977), for rows of three.
+REACH = 2.385 * float(np.sqrt(3.0))
 # More samples than this in a window say nothing new.
 MOST_SAMPLES = 25
 # A held hard iron less sure than this (uT) leaves no usable direction.
@@ -152,14 +154,12 @@ class MagnetometerBuilder:
         corrected = self.reading[rows] @ self.soft_iron.T
         y, turn = turned_mean(window, self.t_ns[rows], corrected, previous.bias.gyroscope())
         A = turn @ self.soft_iron
-        sigma = self.sigma(window.length_s, len(rows))
+        sigma, shared = self.sigma(window.length_s, len(rows)), self.shared(window.length_s)
         used = self._usable(memory) and not self.disturbed(step.predicted.attitude().matrix(), y, A, sigma)
         data = np.concatenate([y, A.ravel(), [np.sin(self.declination), np.cos(self.declination), sigma]])
         keys = (key("X", step.index), key("V", step.index), step.use(self.iron), step.use(self.field))
-        block = Block(
-            self.name, MODEL, [keys], data[None], step.t_ns, rows=(last - 1,), used=(used,), loss=self.config.loss
-        )
-        step.blocks.append(block)
+        loss, reach = self.config.loss, REACH / float(np.sqrt(shared))
+        step.blocks.append(Block(self.name, MODEL, [keys], data[None], step.t_ns, (last - 1,), (used,), loss, reach))
 
     def sigma(self, length_s: float, count: int) -> float:
         """Sigma (uT) of a row of `count` samples over `length_s` s.
@@ -167,8 +167,12 @@ class MagnetometerBuilder:
         The mean of a disturbance that stays alike for tau has over a long time the information of one independent value
         in 2 tau: rows that stand closer share it.
         """
-        shared = max(1.0, 2.0 * self.noise.disturbance_s / length_s)
-        return float(np.sqrt(self.noise.sigma_ut**2 / count + self.noise.disturbance_ut**2 * shared))
+        return float(np.sqrt(self.noise.sigma_ut**2 / count + self.noise.disturbance_ut**2 * self.shared(length_s)))
+
+    def shared(self, length_s: float) -> float:
+        """How many rows of `length_s` s share the information of one disturbance; 1 where there are none. The loss acts
+        on what one row is off by itself."""
+        return max(1.0, 2.0 * self.noise.disturbance_s / length_s) if self.noise.disturbance_ut > 0 else 1.0
 
     def _usable(self, memory: Memory) -> bool:
         """A hard iron that is held although nobody knows it would pass for north."""

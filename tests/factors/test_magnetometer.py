@@ -15,6 +15,7 @@ from smartnav_graph.calibration.model import MagnetometerNoise
 from smartnav_graph.errors import CalibrationError, ConfigError
 from smartnav_graph.factors.magnetometer import (
     MODEL,
+    REACH,
     MagnetometerBuilder,
     MagnetometerConfig,
     SeenField,
@@ -158,6 +159,15 @@ def test_rows_that_share_a_disturbance_share_its_information():
     assert made.sigma(8.0, 10) == pytest.approx(np.sqrt(0.1 + 9.0))  # two correlation times and more: independent
     quarter, whole = made.sigma(0.25, 25), made.sigma(1.0, 25)
     assert quarter**2 / 4 == pytest.approx(whole**2, rel=0.01)  # four rows of a quarter tell what one row does
+
+
+def test_the_loss_acts_on_what_a_row_is_off_by_itself():
+    shared = MagnetometerNoise(sigma_ut=0.1, disturbance_ut=3.0, disturbance_s=2.0, hard_iron_sigma_ut=1.0)
+    for noise, factor in ((shared, 2.0), (replace(shared, disturbance_ut=0.0), 1.0)):
+        (block,) = step_of(builder(noise=noise), turning((0.0, 0.0, 0.0))).blocks
+        assert block.loss == "cauchy" and block.reach == pytest.approx(REACH / factor)
+    # of the row's own 3 uT, not of the 6 uT that four rows with one disturbance have
+    assert builder(noise=shared).sigma(1.0, 10) * REACH / 2.0 == pytest.approx(3.0 * REACH, rel=0.01)
 
 
 @pytest.mark.parametrize(

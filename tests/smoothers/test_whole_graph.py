@@ -128,14 +128,16 @@ def test_the_derivative_of_the_cost_is_the_gradient():
                 assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(gradient.at(name)[axis], abs=1e-6), (loss, letter)
 
 
+@pytest.mark.parametrize("reach", [1.0, 2.5])
 @pytest.mark.parametrize("square", [0.0, 1.0, 1.345**2, 2.0, 400.0])
-def test_losses_are_gtsam_s(square):
+def test_losses_are_gtsam_s(square, reach):
     estimators = gtsam.noiseModel.mEstimator
-    for loss, estimator in (("huber", estimators.Huber.Create(1.345)), ("cauchy", estimators.Cauchy.Create(1.0))):
-        weight, cost = loss_weights(np.array([square]), loss)
+    huber, cauchy = estimators.Huber.Create(1.345 * reach), estimators.Cauchy.Create(reach)
+    for loss, estimator in (("huber", huber), ("cauchy", cauchy)):
+        weight, cost = loss_weights(np.array([square]), loss, reach)
         assert weight[0] == pytest.approx(estimator.weight(np.sqrt(square)), abs=1e-12)
         assert cost[0] == pytest.approx(estimator.loss(np.sqrt(square)), abs=1e-12)
-    assert loss_weights(np.array([square]), "none") == (pytest.approx([1.0]), pytest.approx([0.5 * square]))
+    assert loss_weights(np.array([square]), "none", reach) == (pytest.approx([1.0]), pytest.approx([0.5 * square]))
 
 
 def test_the_loss_is_on_the_norm_of_a_row():
