@@ -16,6 +16,7 @@ from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
 from smartnav_graph.initialise import Initial
 from smartnav_graph.problem import Problem
+from smartnav_graph.rejections import rejections
 from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
@@ -146,6 +147,7 @@ def summarise(
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used_counts(problem, memory)),
         "rejected": {name: len(rows) for name, rows in memory.rejected.items()},
+        "rejections": rejections(problem, estimate, memory),
         "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
         "position_sigma_m": _sigma_summary(keyframes),
         "initialisation": initial.to_dict(),

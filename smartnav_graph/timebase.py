@@ -85,6 +85,10 @@ def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> NDArray[np.intp]:
     return np.where(t - at[right - 1] <= at[right] - t, right - 1, right)
 
 
+# Rows between two straight stretches that make them one.
+MENDED_ROWS = 4
+
+
 @dataclass(frozen=True)
 class Gap:
     """A stretch without honest inertial data.
@@ -116,7 +120,8 @@ def find_gaps(
     Bridged: at least `bridged_rows` successive rows that lie on one straight line of the k-dimensional signal space:
     successive differences, each axis in units of its median step, are parallel within `straightness` rad, and every
     axis moves from row to row (constant and quantised stretches do not count). No honest inertial sensor does that,
-    and the rule does not depend on the stamps, which may be jittered.
+    and the rule does not depend on the stamps, which may be jittered. Stretches that a few rows part, as two that were
+    swapped do, are one.
 
     Parameters
     ----------
@@ -140,9 +145,17 @@ def find_gaps(
     starts = np.flatnonzero(~padded[:-1] & padded[1:])
     ends = np.flatnonzero(padded[:-1] & ~padded[1:])
     # k parallel pairs span k + 2 rows
-    gaps += [
-        Gap(int(t_ns[i]), int(t_ns[j + 1]), "bridged")
-        for i, j in zip(starts, ends, strict=True)
-        if j - i + 2 >= bridged_rows
-    ]
+    long = ends - starts + 2 >= bridged_rows
+    gaps += [Gap(int(t_ns[i]), int(t_ns[j]), "bridged") for i, j in _mended(starts[long], ends[long] + 1)]
     return sorted(gaps, key=lambda gap: gap.start_ns)
+
+
+def _mended(first: NDArray[np.intp], last: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """Stretches of rows, joined where hardly any row lies between: two that were swapped break a straight line."""
+    joined: list[tuple[int, int]] = []
+    for i, j in zip(first.tolist(), last.tolist(), strict=True):
+        if joined and i - joined[-1][1] <= MENDED_ROWS:
+            joined[-1] = (joined[-1][0], j)
+        else:
+            joined.append((i, j))
+    return joined

@@ -155,6 +155,19 @@ def test_a_bridge_needs_five_rows(rows, found):
     assert [gap.length_s for gap in gaps] == pytest.approx([0.01 * (rows - 1)] * found)
 
 
+def test_two_swapped_rows_do_not_split_a_bridge():
+    t, values = signal()
+    drawn = bridge(values, 1000, 1155)
+    drawn[[1070, 1071]] = drawn[[1071, 1070]]
+    assert find_gaps(t, drawn) == [Gap(int(t[1000]), int(t[1155]), "bridged")]
+
+
+def test_two_bridges_with_honest_rows_between_stay_two():
+    t, values = signal()
+    drawn = bridge(bridge(values, 1000, 1100), 1110, 1200)
+    assert len(find_gaps(t, drawn)) == 2
+
+
 def test_a_missing_and_a_bridged_stretch_come_in_time_order():
     t, values = signal()
     drawn = bridge(values, 4000, 4100)

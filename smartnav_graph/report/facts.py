@@ -207,6 +207,17 @@ def why_lines(summary: Summary) -> list[str]:
     return lines
 
 
+def rejections_table(summary: Summary) -> Table:
+    """Every rejected measurement: when, which sensor, how far off."""
+    rows = []
+    for one in summary.get("rejections") or []:
+        size = as_float(one.get("size_m"))
+        off = metres(size) if size is not None else DASH
+        cells = [seconds(one.get("t_s"), 1), sensor_name(str(one.get("sensor"))), off, number(one.get("size_sigma"))]
+        rows.append(Row(cells, {"rejection-s": one.get("t_s"), "size-m": size}))
+    return Table(("Time", "Sensor", "Off by", "Times its sigma"), rows, frozenset({1}))
+
+
 def withheld_table(summary: Summary) -> Table:
     rows = []
     for name, score in room(summary, "withheld").items():

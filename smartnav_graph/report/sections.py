@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.report import charts, facts, statistics, track
-from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres
+from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres, plural
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
 
@@ -140,7 +140,16 @@ def used(session: Session, summary: Summary) -> str:
         '<p class="fine">χ² / dof: squared residuals over their sigmas, per redundant measurement; '
         "1 means the stated noise is right.</p>"
     )
-    return section("used", "What was used", table + why + note)
+    return section("used", "What was used", table + why + _rejections(summary) + note)
+
+
+def _rejections(summary: Summary) -> str:
+    """The rejected measurements one by one, folded away."""
+    table = facts.rejections_table(summary)
+    if not table.rows:
+        return ""
+    head = f"Each of the {plural(len(table.rows), 'rejected measurement')}"
+    return f'<details class="rejections"><summary>{escape(head)}</summary>{table.html()}</details>'
 
 
 def imu_holes(summary: Summary, holes: list[tuple[float, float, str]]) -> str:

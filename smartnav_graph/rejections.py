@@ -1,0 +1,69 @@
+"""Every rejected measurement by itself: when, which sensor, how far off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.graph import Memory
+from smartnav_graph.problem import Problem
+from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.whole_graph import loss_weights
+
+Rejection = Mapping[str, Any]
+
+# Weight below which a redescending loss has left a row out of a run that gates nothing (replay without polish).
+LEFT_OUT = 0.1
+MOST = 10_000  # rejections told one by one
+
+
+def rejections(problem: Problem, estimate: Estimate, memory: Memory) -> list[Rejection]:
+    """Rejected rows in time order: t_s since time zero, sensor, row of its stream, size_sigma (norm of the whitened
+    residual) and, for positions, size_m. The largest `MOST` where there are more."""
+    found = _positions(problem, estimate, memory)
+    known = {(one["sensor"], one["row"]) for one in found}
+    found += [one for one in _rows(problem, estimate) if (one["sensor"], one["row"]) not in known]
+    found = sorted(found, key=lambda one: -float(one["size_sigma"]))[:MOST]
+    return sorted(found, key=lambda one: (one["t_s"], one["sensor"]))
+
+
+def _positions(problem: Problem, estimate: Estimate, memory: Memory) -> list[Rejection]:
+    """Fixes that the gate rejected."""
+    told: list[Rejection] = []
+    for builder in position_builders(problem.builders):
+        residuals = fix_residuals(builder, problem.windows, estimate, memory)
+        stream = getattr(problem.session, builder.name, None)
+        out = np.flatnonzero(~memory.used(builder.name, residuals.rows))
+        metres, sigmas = np.linalg.norm(residuals.residual, axis=1), np.sqrt(residuals.square)
+        for k in out:
+            row = int(residuals.rows[k])
+            t_ns = int(estimate.t_ns[residuals.keyframe[k]] if stream is None else stream.t_ns[row])
+            told.append(_entry(problem, t_ns, builder.name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)})
+    return told
+
+
+def _rows(problem: Problem, estimate: Estimate) -> list[Rejection]:
+    """Rows of blocks that were not used, or that a redescending loss left out."""
+    told: list[Rejection] = []
+    for sensor in sorted({block.sensor for block in estimate.blocks}):
+        for stack in estimate.stacks(sensor):
+            white, _ = stack.linearize(estimate.values)
+            square = (white**2).sum(axis=1)
+            left_out = ~stack.used
+            if stack.loss == "cauchy":
+                left_out |= loss_weights(square, stack.loss)[0] < LEFT_OUT
+            t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys])
+            rows = np.array([row for block in stack.blocks for row in block.rows])
+            told += [
+                _entry(problem, int(t_ns[k]), sensor, int(rows[k]), float(np.sqrt(square[k])))
+                for k in np.flatnonzero(left_out)
+            ]
+    return told
+
+
+def _entry(problem: Problem, t_ns: int, sensor: str, row: int, sigmas: float) -> dict[str, Any]:
+    t_s = float(problem.session.seconds(t_ns))
+    return {"t_s": round(t_s, 4), "sensor": sensor, "row": row, "size_sigma": round(sigmas, 2)}
