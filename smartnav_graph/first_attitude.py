@@ -87,7 +87,7 @@ def attitude_start(imu: Imu, start_ns: int, t_ns: Times, nav_R_body: Floats, bia
     if len(t_s) < 2 or np.diff(t_s).max() * UNAMBIGUOUS * bias_sigma > np.pi:
         return None
     bias, count = np.zeros(3), 2
-    R = seen[0] @ _turns(imu, start_ns, t_s[:1], bias)[0][0].T
+    R = seen[0] @ _turns(imu, start_ns, t_s[:2], bias)[0][0].T
     while True:
         for _ in range(ITERATIONS):
             R, bias = _refined(R, bias, seen[:count], _turns(imu, start_ns, t_s[:count], bias), bias_sigma)

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 import pytest
 from exact import LEVER, START_NS, Graph, Recording, assemble, assert_derivative, record
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import BarometerNoise, Calibration, MagnetometerNoise
@@ -22,7 +23,7 @@ from smartnav_graph.graph import LAST_STAGE, Memory, kind_of
 from smartnav_graph.session import Device, Session
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
-from smartnav_graph.streams import Magnetometer, Velocity, WheelSpeed
+from smartnav_graph.streams import Magnetometer, PoseFix, Velocity, WheelSpeed
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 Wrong = Callable[[Session], Session]
@@ -141,6 +142,33 @@ def uphill(seed: int | None) -> Recording:
     return replace(made, session=session)
 
 
+TURN = np.array([0.02, -0.03, 0.04])  # rad, of the sensor in the body
+DELAY_S = 0.03
+FIX_STATES = {
+    "pose_fixes_time_offset_s": [DELAY_S],
+    "pose_fixes_lever_arm_correction_m": LEVER,
+    "pose_fixes_mount_correction_rad": TURN,
+}
+
+
+@cache
+def recognised(seed: int | None) -> Recording:
+    """A figure eight with a pose fix a second, of a sensor of unknown mount whose stamps are early."""
+    made = record(seed=seed)
+    t = np.arange(0.4, 29.5, 1.0)
+    there = made.trajectory.sample(t + DELAY_S)
+    white = np.random.default_rng((0 if seed is None else seed, 4)).standard_normal((2, len(t), 3)) * (seed is not None)
+    attitude = Rotation.from_rotvec(0.01 * white[0]) * Rotation.from_matrix(there.nav_R_body)
+    stream = PoseFix(
+        t_ns=START_NS + ns_from_seconds(t),
+        enu=there.nav_t_body + there.nav_R_body @ np.array(LEVER) + 0.05 * white[1],
+        sigma=np.full((len(t), 3), 0.05),
+        quat=(attitude * Rotation.from_rotvec(TURN)).as_quat()[:, [3, 0, 1, 2]],
+        sigma_rot=np.full((len(t), 3), 0.01),
+    )
+    return replace(made, session=made.session.replace(pose_fixes=stream))
+
+
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
 
@@ -245,6 +273,27 @@ CASES: dict[str, Case] = {
         known={"step_factor": [0.48, 0.0]},
         noisy=False,
         lookahead_s=1.0,
+    ),
+    "pose_fixes": Case(
+        recognised,
+        0.05,  # a quarter of a millimetre: the force is the mean of the last inertial interval
+        {
+            "nav axes swapped": (_column("pose_fixes", "enu", lambda p: p[:, [1, 0, 2]]), 50.0),
+            "feet": (_column("pose_fixes", "enu", lambda p: p / 0.3048), 50.0),
+            "clock late by 0.1 s": (_late("pose_fixes"), 1.0),  # 1.5 m/s for a sigma of 0.05 m
+        },
+        known=FIX_STATES,
+        stream=("pose_fixes", "enu"),
+    ),
+    "pose_attitude": Case(
+        recognised,
+        0.2,  # two milliradians: the rate changes within 0.03 s
+        {
+            "body to nav": (_column("pose_fixes", "quat", lambda q: q * [1, -1, -1, -1]), 50.0),
+            "scalar last": (_column("pose_fixes", "quat", lambda q: q[:, [3, 0, 1, 2]]), 50.0),
+            "clock late by 0.1 s": (_late("pose_fixes"), 3.0),  # 0.8 rad/s for a sigma of 0.01 rad
+        },
+        known=FIX_STATES,
     ),
     "gnss_velocity": Case(
         car,
