@@ -34,9 +34,10 @@ def test_everything_promised_is_there_and_is_json(summary):
 
 
 def test_counts(summary, eight):
-    assert summary["mode"] == "batch" and summary["keyframes"] == 61
+    assert summary["mode"] == "batch" and summary["keyframes"] == 62  # start, 60 fixes, and the end of the rest
     assert summary["duration_s"] == pytest.approx(59.99)
-    assert summary["factors"] == {"prior": 3, "rest": 5, "gnss": 55, "imu": 60, "imu_bias": 60}
+    rest = {"static": 7, "static_turn": 6}  # the first five seconds, cut by fixes and by the end of the rest
+    assert summary["factors"] == {"prior": 3, "gnss": 55, "imu": 61, "imu_bias": 61, **rest}
     assert summary["used"] == {"gnss": 55} and summary["withheld"]["gnss"]["count"] == 5
     truth = np.linalg.norm(np.diff(eight.reference.enu, axis=0), axis=1).sum()
     assert summary["path_m"] == pytest.approx(truth, rel=0.1)
