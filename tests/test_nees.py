@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,11 @@ from sessions import on_control, positions, recorded, truth, with_gnss
 import smartnav_graph as sn
 from smartnav_graph.evaluation.consistency import average_nees_bounds, nees
 from smartnav_graph.session import Session
+from smartnav_graph.simulation import motions
+from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
+from smartnav_graph.simulation.scenarios import Scenario
+from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
+from smartnav_graph.simulation.trajectory import Trajectory
 
 PARTS = {
     "rotation": slice(0, 3),
@@ -63,6 +70,93 @@ def outside(averages: dict[tuple[str, float], float], seeds: int = 30) -> dict[t
         if not low <= value <= high:
             bad[name, fraction] = value
     return bad
+
+
+# --- every sensor alone, with what it minimally needs -----------------------------------------------------------------
+
+SPARSE = GnssModel(rate_hz=0.1, white_m=1.0)
+
+
+def in_hand(**sensors: Any) -> Scenario:
+    """A phone carried round a figure eight. It rests for a second only: a rest in a simulation is better than its
+    sigma, and at a tenth of the session the phone should be under way."""
+    return Scenario("test", 60.0, lambda s, rng: motions.figure_eight(s, rest=1.0), profile="galaxy-s2", **sensors)
+
+
+def in_car(**sensors: Any) -> Scenario:
+    """A phone in a holder of a car that is already driving, sliding and bouncing by 0.15 m/s."""
+
+    def drive(seconds: float, rng: np.random.Generator) -> Trajectory:
+        car = motions.car(seconds, rng, start_speed=12.0)
+        held = {"held_deg": (3.0, 2.0, 0.0), "carried": (0.0, 1.2, 0.5)}
+        return replace(car, sway=motions.slip(rng, 0.15), sway_speed=12.0, **held)
+
+    return Scenario("test", 120.0, drive, "car", **sensors)
+
+
+def on_foot(**sensors: Any) -> Scenario:
+    """A walk at a steady pace."""
+    motion = partial(motions.walk, paces=(1.35, 1.35))
+    return Scenario("test", 90.0, motion, "foot", "galaxy-s2", **sensors)
+
+
+def on_wheels(**sensors: Any) -> Scenario:
+    """A trolley that stops on a surveyed point in the middle of every side; nobody says that it is one."""
+    return Scenario("test", 160.0, lambda s, rng: motions.trolley(1, rest=8.0), profile="galaxy-s2", **sensors)
+
+
+ALONE: dict[str, Callable[[int], Session]] = {
+    "pose fixes": in_hand(pose_fixes=PoseFixModel(every_s=2.0)),
+    "position fixes": in_hand(pose_fixes=PoseFixModel(every_s=2.0, sigma_rad=0.0)),
+    "standstills": on_wheels(control=True),
+    "magnetometer": in_hand(gnss=SPARSE, magnetometer=MagnetometerModel(hard_iron_sigma_ut=30.0, sigma_ut=3.0)),
+    "barometer": in_hand(gnss=SPARSE, barometer=BarometerModel(walk_hpa=0.01)),
+    "velocity": in_hand(gnss=SPARSE, velocity=SpeedModel(sigma_m_s=0.1)),
+    "gnss velocity": in_hand(gnss=GnssModel(white_m=3.0, velocity_m_s=0.1)),
+    "gnss clock": in_hand(gnss=GnssModel(white_m=0.3, offset_s=0.1)),
+    "gnss wander": in_hand(gnss=GnssModel(white_m=1.0, markov_m=3.0, markov_s=30.0)),
+    "vehicle": in_car(gnss=SPARSE),
+    "wheel": in_car(gnss=SPARSE, wheel=SpeedModel(sigma_m_s=0.1)),
+    "steps": on_foot(gnss=SPARSE),
+    "all in a car": partial(sn.simulate, "car-all-2min"),
+    "all on foot": partial(sn.simulate, "walk-all-2min"),
+}
+
+
+def bold(session: Session) -> Session:
+    """The same recording whose sensors claim half of their sigma."""
+    changes: dict[str, Any] = {}
+    for name, column in (
+        ("pose_fixes", "sigma"),
+        ("pose_fixes", "sigma_rot"),
+        ("velocity", "sigma"),
+        ("wheel", "sigma"),
+    ):
+        stream = changes.get(name, getattr(session, name))
+        if stream is not None and getattr(stream, column) is not None:
+            changes[name] = replace(stream, **{column: getattr(stream, column) / 2})
+    if session.gnss is not None and session.gnss.velocity is not None:
+        changes["gnss"] = replace(session.gnss, sigma_velocity=session.gnss.sigma_velocity / 2)
+    noise = session.calibration.magnetometer_noise
+    mag = replace(noise, sigma_ut=noise.sigma_ut / 2)
+    return session.replace(calibration=replace(session.calibration, magnetometer_noise=mag), **changes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ALONE)
+def test_a_sensor_alone_and_all_together(sensor):
+    assert outside(average_nees(ALONE[sensor])) == {}
+
+
+def test_ten_recordings_with_a_magnetometer():
+    """The quick one of the tests above: heading by a magnetometer with 30 uT of hard iron."""
+    assert outside(average_nees(ALONE["magnetometer"], 10), 10) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["pose fixes", "magnetometer", "velocity", "gnss velocity", "wheel", "all on foot"])
+def test_a_sensor_that_claims_half_its_sigma_is_caught(sensor):
+    assert outside(average_nees(lambda seed: bold(ALONE[sensor](seed)), 15), 15)
 
 
 def control_only(seed: int) -> Session:

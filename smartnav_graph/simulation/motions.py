@@ -86,8 +86,8 @@ def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajector
     return Trajectory(Legs(legs, heading_deg=25.0), sway=sway)
 
 
-def figure_eight(duration: float) -> Trajectory:
+def figure_eight(duration: float, *, rest: float = 5.0) -> Trajectory:
     """A phone carried round a figure eight of 20 s at 1.5 m/s after 5 s of rest, tilting gently."""
-    way = Eight(duration, rest=5.0, ramp=5.0, period=20.0, speed=1.5)
+    way = Eight(duration, rest=rest, ramp=5.0, period=20.0, speed=1.5)
     sway = (Sway(hertz=0.4, tilt=(0.1, 0.2, 0.25)), Sway(hertz=0.9, shift=(0.01, 0.01, 0.03), phase=0.5))
     return Trajectory(way, held_deg=(0.0, 10.0, 0.0), sway=sway, sway_speed=1.5)
