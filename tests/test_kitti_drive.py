@@ -127,7 +127,7 @@ def test_fifty_starts(kitti, batch):
 
 @pytest.fixture(scope="module", params=["isam2", "fixed-lag"])
 def replayed(request, kitti):
-    config = replace(sn.Config(), replay=ReplayConfig(smoother=request.param))
+    config = replace(sn.Config(), replay=ReplayConfig(smoother=request.param, hold=False))
     return request.param, sn.run(kitti, config, causal=True)
 
 
@@ -144,7 +144,8 @@ def test_isam2_is_near_batch_before_the_polish(replayed):
     smoother, run = replayed
     polish = run.summary["polish"]
     if smoother == "isam2":  # it keeps every state; what has left a lag is not corrected any more
-        assert polish["largest_change_m"] <= 0.05 and polish["largest_change_deg"] <= 0.2
+        # the polish finds the noise of the inertial sensors on the way, which a replay cannot
+        assert polish["largest_change_m"] <= 0.05 and polish["largest_change_deg"] <= 0.3
     else:
         assert polish["largest_change_m"] <= 5.0
 

@@ -29,11 +29,13 @@ Floats = NDArray[np.float64]
 @dataclass(frozen=True)
 class ReplayConfig:
     """smoother : fixed-lag or isam2; lag_s; relinearize : factor on the step sizes that call for a new linearisation;
-    polish : solve everything once more at the end."""
+    hold : in isam2, keep clock offsets, lever arms and the like at their prior means; polish : solve everything once
+    more at the end."""
 
     smoother: str = "fixed-lag"
     lag_s: float = 10.0
     relinearize: float = 1.0
+    hold: bool = True
     polish: bool = True
 
     def __post_init__(self) -> None:

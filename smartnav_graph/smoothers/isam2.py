@@ -1,7 +1,7 @@
 """iSAM2 over everything.
 
-QR factorisation, because Cholesky gives up on yaw that is only weakly known. Session states are held: one that touches
-every step would make each update as long as the whole session.
+QR factorisation, because Cholesky gives up on yaw that is only weakly known. Session states are held unless told
+otherwise: one that touches every step makes each update as long as the whole session.
 
 Source: Kaess, Johannsson, Roberts, Ila, Leonard, Dellaert (2012), iSAM2, IJRR 31(2).
 """
@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, State, Step, key
 from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
-from smartnav_graph.smoothers.whole_graph import custom_factor
+from smartnav_graph.smoothers.whole_graph import custom_factor, session_prior
 
 Floats = NDArray[np.float64]
 
@@ -40,16 +40,23 @@ class Isam2(Incremental):
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         super().__init__(config, t0_ns)
         self._engine = gtsam.ISAM2(isam2_params(config.relinearize))
+        self._session: set[int] = set()
 
     def _take(self, step: Step) -> None:
-        step.hold({state.name: state.initial for state in step.session.values()})
-        graph = gtsam.NonlinearFactorGraph()
+        if self.config.hold:
+            step.hold({state.name: state.initial for state in step.session.values()})
+        graph, values = gtsam.NonlinearFactorGraph(), step.values()
         for _, factor in step.factors:
             graph.push_back(factor)
         for block in step.blocks:
             for row in np.flatnonzero(block.used):
                 graph.push_back(custom_factor(block, int(row), step.held))
-        self._engine.update(graph, step.values())
+        for name, state in step.session.items():
+            if name not in self._session:
+                values.insert(name, state.initial)
+                graph.push_back(session_prior(state))
+        self._session |= set(step.session)
+        self._engine.update(graph, values)
 
     def _state(self, step: Step) -> State:
         i, engine = step.index, self._engine
