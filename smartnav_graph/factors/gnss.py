@@ -174,7 +174,7 @@ class PositionBuilder:
         `level` widens it with the robust level of all rows, so that optimistic sigmas reject nothing wholesale; rows
         whose sigma was estimated get twice the sigma: what tails the noise of such fixes has is part of it.
         """
-        limit = float(chi2(3).ppf(probability or self.config.gate_probability)) * max(1.0, level)
+        limit = float(chi2.ppf(probability or self.config.gate_probability, 3)) * max(1.0, level)
         return np.asarray(square > limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
 
     def _loss_of(self, row: int, sigma: Floats, step: Step, memory: Memory) -> str:
@@ -192,7 +192,7 @@ class PositionBuilder:
         """Whether a fix contradicts its prediction, by the normalised square of this one and of those before: an
         outlier hardly moves their median, and a solution that went astray is not left alone for long."""
         known = self._squares
-        level = float(np.median(known) / chi2(3).median()) if len(known) >= SETTLED else CAUSAL_TAIL
+        level = float(np.median(known) / chi2.median(3)) if len(known) >= SETTLED else CAUSAL_TAIL
         known.append(square)
         return bool(self.gate(np.array([square]), level, np.array([row]))[0])
 

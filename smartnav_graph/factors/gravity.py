@@ -125,7 +125,8 @@ class GravityBuilder:
         """Take the window into the stretch; a row where the stretch is long enough."""
         if window.kind == "first":
             self._begin_ns = window.t1_ns
-        if window.kind in ("first", "gap") or window.t0_ns != self._stretch.end_ns:
+        soon = window.t0_ns + round(self.config.stretch_s * NS)  # a stretch that begins now ends then
+        if window.kind in ("first", "gap") or window.t0_ns != self._stretch.end_ns or not self._alone(soon):
             self._stretch = Stretch(end_ns=window.t1_ns)
             return
         self._stretch.add(window, step.bias.gyroscope())
