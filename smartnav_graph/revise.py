@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from smartnav_graph.factors.gnss import PositionBuilder
-from smartnav_graph.factors.observation import turned
+from smartnav_graph.factors.observation import skew, turned
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
 from smartnav_graph.row_noise import row_scales
 from smartnav_graph.smoothers.estimate import Estimate
@@ -77,7 +77,9 @@ def fix_residuals(
     residual = p + v * delay + 0.5 * a * delay**2 + turned(R, lever) - builder.position[rows]
     if builder.name in memory.correlated:
         residual += np.array([estimate.values.atVector(key("C", estimate.indices[k])) for k in keyframe]).reshape(-1, 3)
-    posterior = np.diagonal(estimate.covariance[keyframe][:, 3:6, 3:6], axis1=1, axis2=2)
+    P = estimate.covariance[keyframe][:, :6, :6]
+    there = np.concatenate([-skew(turned(R, lever)), np.broadcast_to(np.eye(3), R.shape)], axis=2)  # of the antenna
+    posterior = np.diagonal(there @ P @ there.transpose(0, 2, 1), axis1=1, axis2=2)
     return FixResiduals(rows, keyframe, residual, sigma, posterior)
 
 
