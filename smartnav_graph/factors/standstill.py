@@ -6,7 +6,9 @@
 
 The second is what is called a zero angular rate update: with the inertial factor beside it the gyro's mean reading is
 its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias would let wander.
-A standstill that is none must not bend the trajectory: beyond `TAIL` sigmas a row pulls with constant force only.
+A standstill that is none must not bend the trajectory. Steady travel looks like rest: there a row that contradicts
+what else is known lets go (Geman, McClure: the force falls with the cube of the residual), and still pulls in what is
+merely unknown. A foot's stance is at worst a slower one: beyond `TAIL` sigmas the force is constant.
 
 Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, IEEE CG&A 25(6); Skog et al. (2010).
 """
@@ -28,8 +30,10 @@ from smartnav_graph.standstill import StandstillConfig, Standstills
 Floats = NDArray[np.float64]
 
 TAIL = 4.0
+# In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second.
+LETS_GO = 30.0
 # The pair of attitudes leaves the positions alone: m.
-ANYWHERE = 10.0
+ANYWHERE = 1e4
 # Prior sigma (m) of the floor's height.
 UNKNOWN_LEVEL = 1000.0
 
@@ -81,13 +85,19 @@ class StandstillBuilder:
                 self._add_turn(step, turn)
 
     def _add_speed(self, step: Step, sigma: float) -> None:
-        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), _tailed(np.full(3, sigma)))
+        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma)))
         step.add(Tag(self.name, step.t_ns), zero)
 
     def _add_turn(self, step: Step, sigma: float) -> None:
         before, here = key("X", step.index - 1), key("X", step.index)
-        model = _tailed(np.array([sigma] * 3 + [ANYWHERE] * 3))
+        model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3))
         step.add(Tag("static_turn", step.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
+
+    def _noise(self, sigmas: Floats) -> gtsam.noiseModel.Base:
+        """Diagonal noise under the loss of a rest or of a stance."""
+        losses = gtsam.noiseModel.mEstimator
+        loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(LETS_GO)
+        return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     def _add_level(self, step: Step) -> None:
         if self._floor is None:
@@ -96,12 +106,6 @@ class StandstillBuilder:
         keys = (key("X", step.index), key("V", step.index), step.use(self._floor))
         data = np.array([[self.config.floor_sigma]])
         step.blocks.append(Block("static_level", MODEL, [keys], data, step.t_ns, loss="huber"))
-
-
-def _tailed(sigmas: Floats) -> gtsam.noiseModel.Base:
-    """Diagonal noise with a loss that grows linearly beyond `TAIL`."""
-    robust = gtsam.noiseModel.mEstimator.Huber.Create(TAIL)
-    return gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 def build(context: FactorContext) -> StandstillBuilder | None:

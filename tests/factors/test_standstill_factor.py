@@ -90,8 +90,16 @@ def test_derivatives():
     assert_observation(Level(), R, p, v, [rng.normal(size=(5, 1))], np.full((5, 1), 0.02))
 
 
-def test_a_false_rest_pulls_with_constant_force_only():
+def test_a_false_rest_lets_go():
     (_, factor), *_ = step_of(StandstillBuilder(rests()), 1.0, 2.0).factors
+    cost = factor.error(values(speed=(20.0, 0.0, 0.0)))
+    assert factor.error(values(speed=(22.0, 0.0, 0.0))) - cost < 1.0  # hardly a force at 20 m/s
+    near = factor.error(values(speed=(0.1, 0.0, 0.0)))
+    assert near == pytest.approx(0.5 * (0.1 / 0.02) ** 2, rel=0.05)  # and all of it at 0.1 m/s
+
+
+def test_a_false_stance_pulls_with_constant_force_only():
+    (_, factor), *_ = step_of(StandstillBuilder(rests(on_foot=True)), 1.0, 2.0).factors
     costs = [factor.error(values(speed=(v, 0.0, 0.0))) for v in (10.0, 20.0, 30.0)]
     assert costs[2] - costs[1] == pytest.approx(costs[1] - costs[0], rel=1e-3)
     assert costs[1] - costs[0] == pytest.approx(TAIL * 10.0 / 0.02, rel=1e-3)
