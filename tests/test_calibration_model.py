@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from smartnav_graph.calibration import model
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise
+from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise, MagnetometerNoise
 from smartnav_graph.errors import CalibrationError
 
 
@@ -70,3 +70,15 @@ def test_every_default_is_a_physical_mems():
         assert isinstance(noise, ImuNoise)
         assert 1e-3 < noise.accel_noise_density < 0.1 and 1e-5 < noise.gyro_noise_density < 1e-2
         assert noise.accel_bias_sigma < 1.0 and noise.gyro_bias_sigma < 0.1
+
+
+def test_the_irons_of_a_magnetometer_survive_the_text():
+    soft = (1.1, 0.02, 0.0, 0.02, 0.9, 0.01, 0.0, 0.01, 1.05)
+    noise = MagnetometerNoise(hard_iron_ut=(12.0, -30.5, 7.0), hard_iron_sigma_ut=0.8, soft_iron=soft)
+    calibration = Calibration(magnetometer_noise=noise)
+    assert model.from_dict(tomllib.loads(model.dumps(calibration))) == calibration
+
+
+def test_a_soft_iron_of_eight_numbers_is_refused_with_the_file():
+    with pytest.raises(CalibrationError, match=r"^phone.toml: .*soft_iron.*expected"):
+        model.from_dict({"magnetometer_noise": {"soft_iron": [1.0] * 8}}, "phone.toml")
