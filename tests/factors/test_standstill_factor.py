@@ -84,7 +84,7 @@ def test_residuals_in_sigmas():
 
 def test_derivatives():
     for _, factor in step_of(StandstillBuilder(rests()), 1.0, 2.0).factors:
-        assert_derivative(factor, values(speed=(0.01, 0.02, 0.0), turn=(1e-3, 2e-3, 0.0)))
+        assert_derivative(factor, values(speed=(1e-4, 2e-4, 0.0), turn=(1e-5, 2e-5, 0.0)))
     rng = np.random.default_rng(0)
     R, p, v = random_rotations(rng, 5), rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
     assert_observation(Level(), R, p, v, [rng.normal(size=(5, 1))], np.full((5, 1), 0.02))
