@@ -200,7 +200,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         weak=problem.config.prior,
         standstill=problem.rests_at_start,
         attitude_start=_oriented(problem, causal=longest_s is not None),
-        **_north(problem),
+        **_north(problem, causal=longest_s is not None),
     )
     return initialiser.run(solve, given)
 
@@ -217,7 +217,7 @@ def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
     return attitude_start(problem.session.require_imu(), start, stream.t_ns[rows], nav_R_body, sigma)
 
 
-def _north(problem: Problem) -> dict[str, Any]:
+def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
     """What the magnetometer says of the start, for the initialiser."""
     builder = next((b for b in problem.builders if isinstance(b, MagnetometerBuilder)), None)
     stream = problem.session.magnetometer
@@ -238,7 +238,7 @@ def _north(problem: Problem) -> dict[str, Any]:
         "magnetometer": stream,
         "declination_deg": problem.session.declination_deg,
         "iron_sigma": builder.iron_sigma,
-        "magnetic_stage": builder.stage,
+        "magnetic_stage": builder.stage if builder.speaks(causal) else None,
         "field_start": start,
     }
 

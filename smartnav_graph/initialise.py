@@ -274,10 +274,11 @@ class Initialiser:
         prior = self._levelled(given.heading_deg, np.array(given.position), given.sigma_m, given.sigma_deg, rest)
         how, stretch = "levelled over a rest" if rest is not None else "levelled by the first two seconds", 0.0
         magnetic = self.field_start
-        if magnetic is not None and np.radians(given.sigma_deg) > OPEN_SIGMA:  # the mean stays what was given
-            pose = prior.start.nav.pose()
-            state = self._state(magnetic.nav_R_body, pose.translation(), np.zeros(3), rest, magnetic.gyro_bias)
-            prior = replace(prior, attitude=pose.rotation(), start=state)
+        if magnetic is not None and np.radians(given.sigma_deg) > OPEN_SIGMA:
+            position = prior.start.nav.position()
+            state = self._state(magnetic.nav_R_body, position, np.zeros(3), rest, magnetic.gyro_bias)
+            sigma = np.array([*prior.sigma_rot[:2], magnetic.heading_sigma])
+            prior = replace(prior, start=state, sigma_rot=sigma, magnetic_stage=self.magnetic_stage)
             how, stretch = f"{how}; turned to magnetic north", magnetic.length_s
         sentence = (
             f"Start given: heading {given.heading_deg:.1f} deg +- {given.sigma_deg:g} deg, position +- "
