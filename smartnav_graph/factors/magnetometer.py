@@ -176,7 +176,11 @@ class MagnetometerBuilder:
 
     def _usable(self, memory: Memory) -> bool:
         """A hard iron that is held although nobody knows it would pass for north."""
-        held = self.iron.name in memory.held or (self.held_in_replay and memory.phase == "causal")
+        return self.speaks(memory.phase == "causal", IRON in memory.held)
+
+    def speaks(self, causal: bool, held: bool = False) -> bool:
+        """Whether rows are used in a replay (`causal`) or a batch run, the hard iron being held or not."""
+        held = held or (causal and self.held_in_replay)
         return not held or self.sure <= SURE_IRON_UT
 
     def disturbed(self, nav_R_body: Floats, y: Floats, A: Floats, sigma: float) -> bool:
