@@ -13,6 +13,7 @@ from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors import ABSOLUTE, BUILDERS
+from smartnav_graph.factors.bridging import bridged
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.pose_fix import at_their_time
 from smartnav_graph.graph import Builder, Window
@@ -22,7 +23,6 @@ from smartnav_graph.standstill import Standstills, find_standstills
 from smartnav_graph.streams import Positioned
 from smartnav_graph.timebase import NS, Gap, find_gaps
 from smartnav_graph.withhold import split
-
 
 # Why a row that replay was handed is not in its solution.
 TOO_LATE = "older than the lag"
@@ -111,7 +111,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     windows, lost = cut(session, config, span, gaps, rests, causal=causal)
     for name, count in lost.items():
         dropped.setdefault(name, {})["arrived after the end"] = count
-    context = FactorContext(session, calibration, gaps, vehicle, config, rests)
+    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal)
     builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
@@ -139,22 +139,28 @@ def cut(
     aiding = {name: stream.t_ns for name, stream in streams.items()}
     epochs = [late.known_ns(stream) if causal else stream.t_ns for stream in streams.values()]
     times = keyframe_times(span, epochs, gaps, spacing, standing)
-    windows = make_windows(session.require_imu(), times, gaps, aiding, spacing, rests.spans())
+    noise = (session.calibration or Calibration()).imu_noise
+    imu = bridged(session.require_imu(), gaps, noise, causal=causal)
+    windows = make_windows(imu, times, gaps, aiding, spacing, rests.spans())
     return late.arrange(windows, streams, merge) if causal else (windows, {})
 
 
 def recut(problem: Problem, known_ns: int | None = None) -> Problem:
-    """The same stretch with every row at the time it speaks of; only rows known by `known_ns` where that is given.
-    The problem itself where no row is late."""
-    merge = round(problem.config.keyframes.merge_s * NS)
-    if not any(late.is_late(s, merge).any() for name in ABSOLUTE if (s := getattr(problem.session, name)) is not None):
+    """The same stretch as batch sees it: every row at the time it speaks of, gaps bridged by all that was recorded; only
+    rows known by `known_ns` where that is given. The problem itself where that is no difference."""
+    session, config, gaps = problem.session, problem.config, problem.gaps
+    merge = round(config.keyframes.merge_s * NS)
+    streams = [stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None]
+    if not gaps and not any(late.is_late(stream, merge).any() for stream in streams):
         return problem
-    session, span = problem.session, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns)
+    span = problem.windows[0].t1_ns, problem.windows[-1].t1_ns
     rests = problem.rests or Standstills.none(session.require_imu().t_ns)
-    windows, _ = cut(session, problem.config, span, problem.gaps, rests, causal=False)
+    windows, _ = cut(session, config, span, gaps, rests, causal=False)
     if known_ns is not None:
         windows = late.forget(windows, session.streams(), known_ns)
-    return replace(problem, windows=windows)
+    context = FactorContext(session, problem.calibration, gaps, problem.vehicle, config, rests)
+    builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
+    return replace(problem, windows=windows, builders=builders)
 
 
 def _choose_sensors(session: Session, chosen: Sequence[str]) -> Session:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors import bridging
+from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import Gap, seconds_since
+from smartnav_graph.timebase import Gap
 
 Floats = NDArray[np.float64]
 
@@ -52,46 +53,6 @@ class ImuConfig:
     def __post_init__(self) -> None:
         if not (self.integration_sigma > 0 and self.gap_factor > 0):
             raise ConfigError("config [imu]", "integration_sigma or gap_factor <= 0", "> 0")
-
-
-@dataclass(frozen=True)
-class BridgeNoise:
-    """Noise densities (3,) of a straight line drawn across a gap: accel m/s^2/sqrt(Hz), gyro rad/s/sqrt(Hz)."""
-
-    accel: Floats
-    gyro: Floats
-
-
-def bridge_noise(imu: Imu, gaps: Sequence[Gap], length_s: float, floor: ImuNoise) -> BridgeNoise:
-    """What a straight line across `length_s` would have cost on the honest stretches of the same recording.
-
-    Every honest stretch of that length is bridged between its end samples; the rms of the integrated error over
-    sqrt(length) is the density. Per axis: a car's forward acceleration is harder to guess than its vertical one.
-    Where no honest stretch is long enough the longest possible one stands in.
-    """
-    t = seconds_since(imu.t_ns, int(imu.t_ns[0]))
-    signal = np.concatenate([imu.accel, imu.gyro], axis=1)
-    steps = 0.5 * (signal[1:] + signal[:-1]) * np.diff(t)[:, None]
-    integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])
-    in_gap = np.zeros(len(t), dtype=np.int64)  # of the interval that ends at each sample
-    for gap in gaps:
-        in_gap[np.searchsorted(imu.t_ns, gap.start_ns) + 1 : np.searchsorted(imu.t_ns, gap.end_ns) + 1] = 1
-    broken = np.cumsum(in_gap)
-    least = np.array([floor.accel_noise_density] * 3 + [floor.gyro_noise_density] * 3)
-    span = length_s
-    while span > 2 * float(np.median(np.diff(t))):
-        starts = np.searchsorted(t, np.arange(t[0], max(t[-1] - span, t[0]), span / 2))
-        ends = np.minimum(np.searchsorted(t, t[starts] + span), len(t) - 1)
-        whole = (broken[ends] == broken[starts]) & (t[ends] - t[starts] > 0.5 * span)
-        if whole.sum() >= 3:
-            i, j = starts[whole], ends[whole]
-            line = 0.5 * (signal[i] + signal[j]) * (t[j] - t[i])[:, None]
-            error = integral[j] - integral[i] - line
-            density = np.sqrt((error**2).mean(axis=0) / span)
-            density = np.maximum(density, 3.0 * least)
-            return BridgeNoise(density[:3], density[3:])
-        span /= 2
-    return BridgeNoise(30.0 * least[:3], 30.0 * least[3:])
 
 
 def accel_part(windows: Sequence[Window], density: float) -> Floats:
@@ -140,7 +101,7 @@ class ImuBuilder:
     noise: ImuNoise
     gravity: float
     gaps: Sequence[Gap] = ()
-    bridges: dict[int, BridgeNoise] = field(default_factory=dict)
+    bridges: dict[int, Bridge] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
     stage: int = 0
@@ -152,7 +113,7 @@ class ImuBuilder:
         """Whether there is more to learn once the trajectory is found: the noise."""
         return self.config.estimate_noise
 
-    def params(self, memory: Memory, bridge: BridgeNoise | None = None) -> gtsam.PreintegrationParams:
+    def params(self, memory: Memory, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
         scale_a, scale_g = memory.scale("accel"), memory.scale("gyro")
         accel = np.full(3, self.noise.accel_noise_density * scale_a)
@@ -166,7 +127,7 @@ class ImuBuilder:
         params.setIntegrationCovariance(np.eye(3) * self.config.integration_sigma**2)
         return params
 
-    def _bridge(self, window: Window) -> BridgeNoise | None:
+    def _bridge(self, window: Window) -> Bridge | None:
         if window.kind != "gap":
             return None
         middle = (window.t0_ns + window.t1_ns) // 2
@@ -204,7 +165,7 @@ class ImuBuilder:
         seconds, self._spent_s = self._spent_s, 0.0
         return seconds
 
-    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.ImuFactor:
+    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.NoiseModelFactor:
         """Factor of a window with the noise of `memory`, whatever noise it was preintegrated with."""
         i, j = window.index - 1, window.index
         factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
@@ -268,7 +229,7 @@ class ImuBuilder:
 def build(context: FactorContext) -> ImuBuilder:
     """The builder of a session's inertial data."""
     imu, noise = context.session.require_imu(), context.calibration.imu_noise
-    bridges = {gap.start_ns: bridge_noise(imu, context.gaps, gap.length_s, noise) for gap in context.gaps}
+    bridges = bridging.bridges(imu, context.gaps, noise, causal=context.causal)
     known = noise != DEVICE_CLASSES[context.calibration.device_class]
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
     return ImuBuilder(noise, context.session.gravity, context.gaps, bridges, context.config.imu, weight=weight)

@@ -1,4 +1,4 @@
-"""Preintegration against independent oracles, and the noise of bridged gaps."""
+"""Preintegration against independent oracles; windows in gaps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors.imu import BridgeNoise, ImuBuilder, ImuConfig, bridge_noise
+from smartnav_graph.factors.bridging import Bridge
+from smartnav_graph.factors.imu import ImuBuilder, ImuConfig
 from smartnav_graph.graph import Memory, State, Step, Window
 from smartnav_graph.keyframes import KeyframeConfig, make_windows
 from smartnav_graph.streams import Imu
@@ -206,67 +207,11 @@ def test_the_step_foretells_the_state_and_its_variance():
 # --- gaps -------------------------------------------------------------------------------------------------------------
 
 
-def shaken(seconds: float = 120.0, seed: int = 0) -> Imu:
-    """White inertial noise, four times as loud on the first axes."""
-    rng = np.random.default_rng(seed)
-    n = round(100 * seconds)
-    loud = np.array([4.0, 1.0, 1.0])
-    return Imu(
-        t_ns=ns_from_seconds(np.arange(n) / 100),
-        accel=rng.standard_normal((n, 3)) * loud + [0, 0, GRAVITY],
-        gyro=0.1 * rng.standard_normal((n, 3)) * loud,
-    )
-
-
-def shaken_density(length: float) -> np.ndarray:
-    """error = sum over the middle minus length * mean of both ends: var = sigma^2 (T dt + T^2 / 2), over T."""
-    return np.array([4.0, 1.0, 1.0]) * np.sqrt(0.01 + length / 2)
-
-
-def test_a_straight_line_across_white_noise_costs_its_ends_and_its_middle():
-    found = bridge_noise(shaken(600.0), (), 1.5, NOISE)
-    expected = shaken_density(1.5)
-    np.testing.assert_allclose(found.accel, expected, rtol=0.12)
-    np.testing.assert_allclose(found.gyro, 0.1 * expected, rtol=0.12)
-
-
-def test_a_gap_is_never_surer_than_honest_data():
-    still = Imu(
-        t_ns=ns_from_seconds(np.arange(6000) / 100),
-        accel=np.tile([0.0, 0.0, GRAVITY], (6000, 1)),
-        gyro=np.zeros((6000, 3)),
-    )
-    found = bridge_noise(still, (), 1.5, NOISE)
-    np.testing.assert_allclose(found.accel, 3 * NOISE.accel_noise_density)
-    np.testing.assert_allclose(found.gyro, 3 * NOISE.gyro_noise_density)
-
-
-def test_stretches_across_other_gaps_do_not_count():
-    imu = shaken()
-    wild = np.array(imu.accel)
-    wild[5000:5200] += 1000.0  # what stands inside a gap must not leak into the noise of another
-    gap = Gap(int(imu.t_ns[4999]), int(imu.t_ns[5200]), "bridged")
-    found = bridge_noise(replace(imu, accel=wild), [gap], 1.5, NOISE)
-    np.testing.assert_allclose(found.accel, bridge_noise(imu, [gap], 1.5, NOISE).accel)
-    assert found.accel.max() < 10 < bridge_noise(replace(imu, accel=wild), (), 1.5, NOISE).accel.max()
-
-
-def test_a_gap_longer_than_any_honest_stretch_takes_the_longest_there_is():
-    short = bridge_noise(shaken(4.0), (), 60.0, NOISE)
-    np.testing.assert_allclose(short.accel, shaken_density(1.875), rtol=0.6)  # of a handful of stretches
-
-
-def test_two_samples_only():
-    bare = Imu(t_ns=[0, 2 * NS], accel=np.zeros((2, 3)), gyro=np.zeros((2, 3)))
-    found = bridge_noise(bare, (), 2.0, NOISE)
-    assert (found.accel == 30 * NOISE.accel_noise_density).all() and (found.gyro == 30 * NOISE.gyro_noise_density).all()
-
-
 def test_a_window_in_a_gap_takes_the_bridge_noise():
     n = 1000
     imu = Imu(t_ns=ns_from_seconds(np.arange(n) / 100), accel=np.tile([0, 0, GRAVITY], (n, 1)), gyro=np.zeros((n, 3)))
     gap = Gap(4 * NS, 5 * NS, "bridged")
-    bridge = BridgeNoise(np.array([2.0, 1.0, 0.5]), np.array([0.03, 0.02, 0.01]))
+    bridge = Bridge(np.array([2.0, 1.0, 0.5]), np.array([0.03, 0.02, 0.01]))
     ours = ImuBuilder(NOISE, GRAVITY, [gap], {gap.start_ns: bridge})
     windows = make_windows(imu, np.array([3, 4, 5, 6]) * NS, [gap], {}, KeyframeConfig())
     assert [w.kind for w in windows] == ["first", "normal", "gap", "normal"]

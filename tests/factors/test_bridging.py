@@ -1,0 +1,150 @@
+"""Bridges across gaps: what honest stretches teach, and what they promise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from smartnav_graph.calibration.model import DEVICE_CLASSES
+from smartnav_graph.factors.bridging import FLOOR, UNKNOWN, bridged, bridges
+from smartnav_graph.streams import Imu
+from smartnav_graph.timebase import NS, Gap, ns_from_seconds
+
+NOISE = DEVICE_CLASSES["mems"]
+GRAVITY = 9.81
+
+
+def swinging(seconds: float = 300.0, noise: float = 0.0, seed: int = 0) -> Imu:
+    """A turn rate and a force that swing with 4 to 9 s, and white noise; gravity on z. 100 Hz."""
+    t = np.arange(round(100 * seconds)) / 100
+    rng = np.random.default_rng(seed)
+    waves = np.stack([np.sin(2 * np.pi * t / period + period) for period in (4.0, 6.0, 9.0)], axis=-1)
+    accel = waves + [0, 0, GRAVITY] + noise * rng.standard_normal((len(t), 3))
+    gyro = 0.3 * waves[:, ::-1] + 0.3 * noise * rng.standard_normal((len(t), 3))
+    return Imu(t_ns=ns_from_seconds(t), accel=accel, gyro=gyro)
+
+
+def hole(imu: Imu, start: int, rows: int, kind: str = "bridged") -> Gap:
+    return Gap(int(imu.t_ns[start]), int(imu.t_ns[start + rows]), kind)
+
+
+def straight(imu: Imu, gaps: list[Gap]) -> Imu:
+    """The samples of the gaps replaced by straight lines, as somebody did."""
+    accel, gyro = np.array(imu.accel), np.array(imu.gyro)
+    for gap in gaps:
+        i, j = np.searchsorted(imu.t_ns, [gap.start_ns, gap.end_ns])
+        for rows in (accel, gyro):
+            rows[i : j + 1] = np.linspace(rows[i], rows[j], j - i + 1)
+    return replace(imu, accel=accel, gyro=gyro)
+
+
+def mean(imu: Imu, gap: Gap) -> np.ndarray:
+    """Mean (6,) of force and rate over the gap."""
+    inside = (imu.t_ns >= gap.start_ns) & (imu.t_ns <= gap.end_ns)
+    rows = np.concatenate([imu.accel, imu.gyro], axis=1)[inside]
+    return np.trapezoid(rows, imu.t_ns[inside] / NS, axis=0) / gap.length_s
+
+
+def test_a_swing_is_carried_on_across_the_gap():
+    imu = swinging()
+    gaps = [hole(imu, i, 160) for i in range(3000, 27000, 3100)]
+    line = straight(imu, gaps)
+    found = bridges(line, gaps, NOISE)
+    error, drawn = (
+        np.sqrt(np.mean([(guess(gap) - mean(imu, gap)) ** 2 for gap in gaps], axis=0))
+        for guess in (lambda gap: found[gap.start_ns].mean, lambda gap: mean(line, gap))
+    )
+    assert (error < 0.1 * drawn).all(), (error, drawn)
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0])
+def test_the_noise_is_what_unseen_gaps_turn_out_to_cost(noise):
+    imu = swinging(600.0, noise)
+    gaps = [hole(imu, i, 160) for i in range(1500, 58000, 1000)]
+    found = bridges(straight(imu, gaps), gaps, NOISE)
+    error = np.array([found[gap.start_ns].mean - mean(imu, gap) for gap in gaps])
+    cost = np.sqrt((error**2).mean(axis=0) * gaps[0].length_s)  # as a density
+    told = np.concatenate([found[gaps[0].start_ns].accel, found[gaps[0].start_ns].gyro])
+    np.testing.assert_allclose(told, cost, rtol=0.35)
+
+
+def test_vibration_is_averaged():
+    """Two single samples of noise sigma leave sigma / sqrt(2) in the mean of their line, means over 0.6 s far less."""
+    rng = np.random.default_rng(2)
+    n = 30_000
+    imu = Imu(
+        t_ns=ns_from_seconds(np.arange(n) / 100),
+        accel=np.array([0, 0, GRAVITY]) + rng.standard_normal((n, 3)),
+        gyro=0.1 * rng.standard_normal((n, 3)),
+    )
+    gap = hole(imu, 15_000, 160)
+    found = bridges(imu, [gap], NOISE)[gap.start_ns]
+    line = np.sqrt(0.5 * gap.length_s)
+    assert (found.accel < 0.3 * line).all() and (found.gyro < 0.03 * line).all()
+
+
+def test_a_bridge_is_never_surer_than_honest_data():
+    imu = Imu(
+        t_ns=ns_from_seconds(np.arange(6000) / 100),
+        accel=np.tile([0.0, 0.0, GRAVITY], (6000, 1)),
+        gyro=np.zeros((6000, 3)),
+    )
+    gap = hole(imu, 3000, 150)
+    found = bridges(imu, [gap], NOISE)[gap.start_ns]
+    np.testing.assert_allclose(found.accel, FLOOR * NOISE.accel_noise_density)
+    np.testing.assert_allclose(found.gyro, FLOOR * NOISE.gyro_noise_density)
+    np.testing.assert_allclose(found.mean, [0, 0, GRAVITY, 0, 0, 0], atol=1e-6)
+
+
+def test_what_stands_inside_a_gap_teaches_nothing():
+    imu = swinging(noise=0.5)
+    gap, other = hole(imu, 5000, 160), hole(imu, 5200, 160)
+    wild = np.array(imu.accel)
+    for g in (gap, other):
+        i, j = np.searchsorted(imu.t_ns, [g.start_ns, g.end_ns])
+        wild[i + 1 : j] += 1000.0
+    one, two = (bridges(x, [gap, other], NOISE)[gap.start_ns] for x in (imu, replace(imu, accel=wild)))
+    np.testing.assert_allclose(two.mean, one.mean, rtol=1e-9)
+    np.testing.assert_allclose(two.accel, one.accel, rtol=1e-9)
+
+
+def test_a_gap_longer_than_the_rest_learns_from_shorter_stretches():
+    imu = swinging(40.0, 0.5)
+    gap = hole(imu, 1000, 2500)
+    found = bridges(imu, [gap], NOISE)[gap.start_ns]
+    assert found.mean is not None and found.accel.max() < UNKNOWN * NOISE.accel_noise_density
+
+
+def test_two_samples_only():
+    bare = Imu(t_ns=[0, 2 * NS], accel=np.zeros((2, 3)), gyro=np.zeros((2, 3)))
+    found = bridges(bare, [Gap(0, 2 * NS, "missing")], NOISE)[0]
+    assert found.mean is None
+    assert (found.accel == UNKNOWN * NOISE.accel_noise_density).all()
+    assert (found.gyro == UNKNOWN * NOISE.gyro_noise_density).all()
+
+
+def test_a_gap_at_the_very_start_is_seen_from_its_end():
+    imu = swinging(noise=0.2)
+    late = imu.take((imu.t_ns == 0) | (imu.t_ns >= 2 * NS))
+    gap = Gap(0, 2 * NS, "missing")
+    found = bridges(late, [gap], NOISE)[0]
+    assert np.abs(found.mean - mean(imu, gap))[:3].max() < 4 * found.accel.max() / np.sqrt(gap.length_s)
+
+
+@pytest.mark.parametrize("kind", ["missing", "bridged"])
+def test_the_curve_has_the_mean_and_leaves_the_rest_alone(kind):
+    imu = swinging(noise=0.1)
+    gap = hole(imu, 5000, 160, kind)
+    inside = (imu.t_ns > gap.start_ns) & (imu.t_ns < gap.end_ns)
+    faulty = imu.take(~inside) if kind == "missing" else straight(imu, [gap])
+    filled = bridged(faulty, [gap], NOISE)
+    np.testing.assert_array_equal(filled.t_ns, imu.t_ns)
+    np.testing.assert_allclose(filled.accel[~inside], imu.accel[~inside], atol=1e-9)
+    np.testing.assert_allclose(mean(filled, gap), bridges(faulty, [gap], NOISE)[gap.start_ns].mean, atol=1e-4)
+
+
+def test_without_gaps_nothing_changes():
+    imu = swinging(5.0)
+    assert bridged(imu, [], NOISE) is imu
