@@ -32,7 +32,7 @@ from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, bui
 from smartnav_graph.initialise import Given, Initial, Initialiser
 from smartnav_graph.late import known_ns
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
-from smartnav_graph.revise import position_builders, revise
+from smartnav_graph.revise import extra_passes, position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
@@ -135,7 +135,7 @@ def solve_passes(
     -------
     estimate, the memory it was made with, and the number of passes
     """
-    most = problem.config.run.passes
+    most = problem.config.run.passes + extra_passes(problem.builders)
     precision = FIRST if unsure else problem.config.solve
     builders = [prior, *problem.builders]
     for count in range(1, most + 1):

@@ -28,7 +28,7 @@ def weights(square: Floats, limit: float, mu: float) -> Floats:
     """Weights (m,) of rows with squares (m,) for c^2 = `limit`; of an infinite mu they are 0 or 1."""
     if np.isinf(mu):
         return np.asarray((square <= limit).astype(np.float64))
-    middle = np.sqrt(limit * mu * (mu + 1.0) / np.maximum(square, 1e-300)) - mu
+    middle = np.sqrt(limit * mu * (mu + 1.0) / np.maximum(square, 1e-12 * limit)) - mu
     return np.asarray(np.clip(middle, 0.0, 1.0))
 
 

@@ -276,8 +276,10 @@ class Memory:
     held : session states that stay at a value (d,), by name
     stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
     constraints, time offsets, magnetometer, steps)
-    phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``gated`` (least squares
-    without them), ``causal`` (replay: least squares, a redescending loss where a fix contradicts the prediction)
+    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is
+    phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``graduated`` (truncated least
+    squares by and by, where asked for), ``gated`` (least squares without outliers), ``causal`` (replay: least squares,
+    a redescending loss where a fix contradicts the prediction)
     """
 
     noise_scales: Mapping[str, float] = field(default_factory=dict)
@@ -286,6 +288,12 @@ class Memory:
     held: Mapping[str, Floats] = field(default_factory=dict)
     stage: int = 0
     phase: str = "plain"
+    weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    control: float = 0.0
+
+    def weight(self, sensor: str, row: int) -> float:
+        """Weight of a row while the loss is graduated, 1 otherwise."""
+        return self.weights.get(sensor, {}).get(row, 1.0)
 
     def scale(self, group: str) -> float:
         return self.noise_scales.get(group, 1.0)

@@ -1,7 +1,8 @@
 """What one pass teaches the next: which fixes to reject, and how noisy the sensors are.
 
 Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
-and rows inside the gate are let in again. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
+and rows inside the gate are let in again. Where asked for, truncated least squares by graduated non-convexity stands
+between the two, warm-started by the first. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
 with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6). What needs the
 trajectory found first (time offsets, vehicle constraints, wandering errors) joins when nothing is left to learn
 without it; session states that the data do not determine are held at their calibrated value.
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from smartnav_graph import graduated
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import skew, turned
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
@@ -89,20 +91,26 @@ def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How one sensor's rows stand at the estimate: rows (m,), normalised squares (m,) and a gate over them."""
+    """How one sensor's rows stand at the estimate: rows (m,), normalised squares (m,), and the largest square of good
+    ones by the level of all and a probability; graduated: whether its loss is to be truncated by and by."""
 
     name: str
     rows: NDArray[np.intp]
     square: Floats
     dim: int
-    gate: Callable[[Floats, float, float | None], NDArray[np.bool_]]
+    limit: Callable[[float, float | None], Floats]
+    graduated: bool = False
 
     def outside(self, probability: float | None = None) -> frozenset[int]:
         """Rows beyond the gate, at the robust level of all rows."""
         level = float(np.median(self.square)) / float(chi2(self.dim).median())
-        return frozenset(int(row) for row in self.rows[self.gate(self.square, level, probability)])
+        return np.asarray(self.square / self.limit(level, probability))
 
 
+        return frozenset(int(row) for row in self.rows[self.relative(probability) > 1.0])
+
+    def relative(self, probability: float | None = None) -> Floats:
+        """Squares (m,) in units of the gate's."""
 def verdicts(
     builders: Iterable[Builder], found: Mapping[str, FixResiduals], estimate: Estimate, memory: Memory
 ) -> list[Verdict]:
@@ -110,7 +118,7 @@ def verdicts(
     result = []
     for builder in builders:
         if isinstance(builder, PositionBuilder):
-            if builder.config.loss == "gate" and builder.name in found:
+            if builder.gated and builder.name in found:
                 result.append(_position_verdict(builder, found[builder.name], memory))
         elif getattr(builder, "gate_probability", None):
             result += _block_verdict(builder, estimate)
@@ -121,10 +129,10 @@ def _position_verdict(builder: PositionBuilder, found: FixResiduals, memory: Mem
     sigma = np.maximum(builder.scaled_sigma(memory)[found.rows], builder.least_gate_sigma)
     square = ((found.residual / sigma) ** 2).sum(axis=1)
 
-    def gate(square: Floats, level: float, probability: float | None) -> NDArray[np.bool_]:
-        return builder.gate(square, level, found.rows, probability)
+    def limit(level: float, probability: float | None) -> Floats:
+        return builder.limit(level, found.rows, probability)
 
-    return Verdict(builder.name, found.rows, square, 3, gate)
+    return Verdict(builder.name, found.rows, square, 3, limit, builder.config.loss == "gnc")
 
 
 def _block_verdict(builder: Any, estimate: Estimate) -> list[Verdict]:
@@ -135,12 +143,11 @@ def _block_verdict(builder: Any, estimate: Estimate) -> list[Verdict]:
     square = np.concatenate([(rows**2).sum(axis=1) for rows in white])
     dim = white[0].shape[1]
 
-    def gate(square: Floats, level: float, probability: float | None) -> NDArray[np.bool_]:
-        limit = float(chi2(dim).ppf(probability or builder.gate_probability)) * max(1.0, level)
-        return np.asarray(square > limit)
+    def limit(level: float, probability: float | None) -> Floats:
+        return np.full(len(square), chi2(dim).ppf(probability or builder.gate_probability) * max(1.0, level))
 
     rows = np.array([row for stack in stacks for block in stack.blocks for row in block.rows], dtype=np.intp)
-    return [Verdict(builder.name, rows, square, dim, gate)]
+    return [Verdict(builder.name, rows, square, dim, limit)]
 
 
 def revise(
@@ -156,8 +163,11 @@ def revise(
     if memory.phase == "plain" and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
         return replace(new, phase="robust"), False
     outliers = {v.name: v.outside() for v in judged}
-    if memory.phase == "robust":
-        return replace(new, phase="gated", rejected=outliers), False
+    if memory.phase in ("robust", "graduated"):
+        weighed = _graduated(judged, memory)
+        if weighed is not None:
+            return replace(weighed, noise_scales=new.noise_scales), False
+        return replace(new, phase="gated", rejected=outliers, weights={}), False
     if memory.phase == "gated":
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / memory.scale(name))) < STEADY for name in found)
@@ -174,6 +184,29 @@ def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> M
     """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
     positions = position_builders(builders)
     wandering = frozenset(b.name for b in positions if b.wanders(memory))
+def _graduated(judged: Sequence[Verdict], memory: Memory) -> Memory | None:
+    """The memory with the weights of the next control; None where every weight is settled, or none is asked for."""
+    asked = [v for v in judged if v.graduated]
+    if not asked:
+        return None
+    squares = {v.name: v.relative() for v in asked}
+    if memory.phase == "robust":
+        control = min(graduated.first_control(square, 1.0) for square in squares.values())
+    else:
+        control = GROWTH * memory.control
+    found = {name: graduated.weights(square, 1.0, control) for name, square in squares.items()}
+    if all(graduated.settled(weight) for weight in found.values()):
+        return None
+    weights = {v.name: dict(zip(v.rows.tolist(), found[v.name].tolist(), strict=True)) for v in asked}
+    rejected = {v.name: v.outside() for v in judged if not v.graduated}
+    return replace(memory, phase="graduated", rejected=rejected, weights=weights, control=control)
+
+
+def extra_passes(builders: Iterable[Builder]) -> int:
+    """Passes that a graduated loss needs beyond those of the others."""
+    return GRADUATED_PASSES if any(b.config.loss == "gnc" for b in position_builders(builders)) else 0
+
+
     if memory.stage < LAST_STAGE:
         later = any(b.stage == LAST_STAGE or (hasattr(b, "grows") and b.grows(memory)) for b in builders)
         return replace(memory, stage=LAST_STAGE, correlated=wandering) if later else memory

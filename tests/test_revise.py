@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact import assemble, estimate_of, record, state
+from exact import LEVER, assemble, estimate_of, record, state
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
 from smartnav_graph.config import Config, RunConfig
@@ -108,6 +108,33 @@ def test_planted_outliers_are_found_exactly(drive, off):
     assert memory.phase == "gated"
 
 
+def test_graduated_non_convexity_finds_them_too(drive):
+    off = frozenset({8, 40, 41, 42, 43, 90, 120})
+    problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), gnc())
+    initial = initialise(problem)
+    _, memory, passes = solve_passes(problem, problem.windows, initial.prior, Memory())
+    assert memory.rejected["gnss"] == off and memory.phase == "gated" and not memory.weights
+    assert 6 <= passes <= 20  # the control grows fourfold a pass
+
+
+def gnc() -> Config:
+    return Config(gnss=GnssConfig(loss="gnc"))
+
+
+def test_the_control_grows_until_every_weight_is_settled(drive):
+    session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
+    builders, windows, estimate = at_truth(drive, session, loss="gnc")
+    memory, controls = Memory(phase="robust"), []
+    while memory.phase != "gated":
+        memory, done = revise(builders, windows, estimate, memory)
+        assert not done
+        controls.append(memory.control)
+        if memory.phase == "graduated":
+            assert memory.weight("gnss", 40) < 0.5 * memory.weight("gnss", 41)
+    assert memory.rejected == {"gnss": frozenset({40})} and not memory.weights
+    assert np.allclose(np.diff(np.log(controls[:-1])), np.log(4.0))
+
+
 @pytest.mark.parametrize("off", [{40}, {1, 110}], ids=["one", "near the start"])
 def test_outliers_among_the_first_fixes_do_not_mislead_the_start(drive, off):
     problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), Config())
@@ -119,7 +146,7 @@ def test_outliers_among_the_first_fixes_do_not_mislead_the_start(drive, off):
 @pytest.mark.parametrize("seed", range(3))
 def test_good_fixes_are_all_kept_without_a_robust_pass(drive, seed):
     memory, passes = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, seed=seed))
-    assert not memory.rejected.get("gnss") and memory.phase == "plain" and passes <= 2
+    assert not memory.rejected.get("gnss") and memory.phase == "plain" and passes <= 5  # the noise is found
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -158,7 +185,8 @@ def test_residuals_are_those_of_the_antenna(drive):
     np.testing.assert_allclose(found.residual, np.tile([1.0, 2.0, 3.0], (len(session.gnss), 1)), atol=1e-6)
     np.testing.assert_allclose(found.sigma, np.tile([6.0, 6.0, 10.0], (len(session.gnss), 1)))
     np.testing.assert_allclose(found.square, 1 / 36 + 4 / 36 + 9 / 100)
-    np.testing.assert_allclose(found.posterior, 1e-4)
+    # attitude and position known to 1e-4 rad^2 and m^2: the antenna turns about the body
+    np.testing.assert_allclose(found.posterior.sum(axis=1), 1e-4 * (3 + 2 * np.dot(LEVER, LEVER)))
     assert found.rows.tolist() == list(range(len(session.gnss)))
 
 

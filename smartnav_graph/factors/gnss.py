@@ -37,15 +37,17 @@ ESTIMATED_TAIL = 4.0
 CAUSAL_TAIL = 9.0
 SETTLED = 10
 REMEMBERED = 30
+LEAST_WEIGHT = 1e-4  # below it a row is left out
 
 
 @dataclass(frozen=True)
 class GnssConfig:
-    """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``huber`` or
-    ``none``; gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes
-    that carry none from the kept data; correlated : give the wandering error of code receivers a state;
-    time_offset_sigma : s, prior of the receiver's clock offset, a state (zero: none); lever_arm_sigma : m, prior of the
-    lever arm as a state (zero: taken as known)."""
+    """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``gnc``
+    (truncated least squares by graduated non-convexity between Cauchy and gate), ``huber`` or ``none``;
+    gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes that carry
+    none from the kept data; correlated : give the wandering error of code receivers a state; time_offset_sigma : s,
+    prior of the receiver's clock offset, a state (zero: none); lever_arm_sigma : m, prior of the lever arm as a state
+    (zero: taken as known)."""
 
     loss: str = "gate"
     gate_probability: float = 0.999
@@ -55,8 +57,8 @@ class GnssConfig:
     lever_arm_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.loss not in ("gate", "huber", "none"):
-            raise ConfigError("config [gnss]", f"loss = {self.loss!r}", "gate, huber or none")
+        if self.loss not in ("gate", "gnc", "huber", "none"):
+            raise ConfigError("config [gnss]", f"loss = {self.loss!r}", "gate, gnc, huber or none")
         if not 0.5 < self.gate_probability < 1:
             raise ConfigError("config [gnss]", f"gate_probability = {self.gate_probability}", "between 0.5 and 1")
         if min(self.time_offset_sigma, self.lever_arm_sigma) < 0:
@@ -169,17 +171,26 @@ class PositionBuilder:
     def gate(
         self, square: Floats, level: float, rows: NDArray[np.intp], probability: float | None = None
     ) -> NDArray[np.bool_]:
-        """Which rows, of normalised squares (m,), lie outside the chi-square gate (of the configured probability).
+        """Which rows, of normalised squares (m,), lie outside the chi-square gate; see `limit`."""
+        return np.asarray(square > self.limit(level, rows, probability))
+
+    def limit(self, level: float, rows: NDArray[np.intp], probability: float | None = None) -> Floats:
+        """Largest normalised square (m,) inside the chi-square gate (of the configured probability).
 
         `level` widens it with the robust level of all rows, so that optimistic sigmas reject nothing wholesale; rows
         whose sigma was estimated get twice the sigma: what tails the noise of such fixes has is part of it.
         """
         limit = float(chi2.ppf(probability or self.config.gate_probability, 3)) * max(1.0, level)
-        return np.asarray(square > limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
+        return np.asarray(limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
+
+    @property
+    def gated(self) -> bool:
+        """Whether outliers are looked for."""
+        return self.config.loss in ("gate", "gnc")
 
     def _loss_of(self, row: int, sigma: Floats, step: Step, memory: Memory) -> str:
         """Loss of one fix in the phase at hand; see `Memory`."""
-        if self.config.loss != "gate":
+        if not self.gated:
             return self.config.loss
         if memory.phase != "causal" or step.variance is None:
             return "cauchy" if memory.phase == "robust" else "none"
@@ -252,9 +263,10 @@ class PositionBuilder:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
         sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
-        used = not memory.is_rejected(self.name, row)
+        weight = memory.weight(self.name, row)
+        used = not memory.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         loss = self._loss_of(row, sigma, step, memory) if index == step.index else self._loss_late(memory)
-        sigma, loss = self._softened(sigma, loss)
+        sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
         chain = self.name in memory.correlated
         if partial is None and not (states or chain):
             if used:

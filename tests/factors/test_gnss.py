@@ -161,7 +161,7 @@ def test_a_good_share_of_good_fixes_stays_inside_the_gate():
 
 @pytest.mark.parametrize(
     ("wrong", "text"),
-    [({"loss": "tukey"}, "gate, huber or none"), ({"gate_probability": 1.0}, "between 0.5 and 1")],
+    [({"loss": "tukey"}, "gate, gnc, huber or none"), ({"gate_probability": 1.0}, "between 0.5 and 1")],
 )
 def test_config_names_what_is_wrong(wrong, text):
     with pytest.raises(ConfigError, match=rf"config \[gnss\]: .*; expected {text}"):
