@@ -144,8 +144,8 @@ def test_isam2_is_near_batch_before_the_polish(replayed):
     smoother, run = replayed
     polish = run.summary["polish"]
     if smoother == "isam2":  # it keeps every state; what has left a lag is not corrected any more
-        # the polish finds the noise of the inertial sensors on the way, which a replay cannot
-        assert polish["largest_change_m"] <= 0.05 and polish["largest_change_deg"] <= 0.3
+        # the polish learns the noise of sensors and gaps from all that was recorded, which a replay cannot
+        assert polish["largest_change_m"] <= 0.08 and polish["largest_change_deg"] <= 0.3
     else:
         assert polish["largest_change_m"] <= 5.0
 

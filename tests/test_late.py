@@ -150,7 +150,8 @@ def test_the_polish_uses_every_row_at_its_own_time():
     session = with_points()
     batch, run = sn.run(session), sn.run(session, config(), causal=True)
     assert np.array_equal(run.solution.t_ns, batch.solution.t_ns)
-    assert np.linalg.norm(run.solution.nav_t_body - batch.solution.nav_t_body, axis=1).max() < 1e-3
+    # m; two ways to noise that is found to within a few per cent
+    assert np.linalg.norm(run.solution.nav_t_body - batch.solution.nav_t_body, axis=1).max() < 5e-3
     known_at_once = session.replace(control=replace(session.control, arrival_ns=None))
     assert np.array_equal(batch.solution.nav_t_body, sn.run(known_at_once).solution.nav_t_body)
 
@@ -201,3 +202,21 @@ def test_without_a_loss_a_late_row_is_least_squares():
     options = replace(config(polish=False), gnss=GnssConfig(loss="none"))
     run = sn.run(session, options, causal=True)
     assert np.isfinite(run.causal.covariance).all()
+
+
+@pytest.mark.parametrize("smoother", ["isam2", "fixed-lag"])
+def test_a_gap_is_bridged_by_what_came_before(smoother):
+    """Rougher motion after 42 s teaches batch to trust the bridge less; a replay that was past it knows nothing of it."""
+    session = recorded()
+    seconds = session.seconds(session.imu.t_ns)
+    session = session.replace(imu=session.imu.take((seconds < 36.0) | (seconds > 37.5)))
+    after = session.seconds(session.imu.t_ns) > 42.0
+    shaking = 3.0 * np.random.default_rng(0).standard_normal(session.imu.accel.shape) * after[:, None]
+    changed = with_imu(session, accel=session.imu.accel + shaking)
+    one, other = (sn.run(s, config(smoother, polish=False), causal=True) for s in (session, changed))
+    assert [gap["start_s"] for gap in one.summary["gaps"]] == [pytest.approx(36.0, abs=0.02)]
+    known = one.causal.seconds <= 42.0
+    assert np.array_equal(one.causal.nav_t_body[known], other.causal.nav_t_body[known])
+    assert np.array_equal(one.causal.covariance[known], other.causal.covariance[known])
+    whole, shaken = (prepare(s, Config(), causal=False).builders[0].bridges for s in (session, changed))
+    assert all((shaken[start].accel > 1.2 * bridge.accel).any() for start, bridge in whole.items())

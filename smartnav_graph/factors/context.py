@@ -15,8 +15,8 @@ from smartnav_graph.timebase import Gap
 @dataclass(frozen=True)
 class FactorContext:
     """The session without its withheld rows, the device's calibration, holes of the inertial data, what carries the
-    device (none, car, trolley, foot), the options of all rooms (`config.Config`, which stands below this room), and the
-    standstills of the recording."""
+    device (none, car, trolley, foot), the options of all rooms (`config.Config`, which stands below this room), the
+    standstills of the recording, and whether nothing may be learnt from what comes later (replay)."""
 
     session: Session
     calibration: Calibration
@@ -24,6 +24,7 @@ class FactorContext:
     vehicle: str
     config: Any
     rests: Standstills | None = None
+    causal: bool = False
 
     @property
     def on_foot(self) -> bool:
