@@ -7,7 +7,7 @@ import pytest
 
 from smartnav_graph import graduated
 
-SQUARES = np.array([0.0, 0.5, 3.0, 9.0, 20.0, 400.0, 1e4])
+SQUARES = np.array([0.0, 0.5, 3.0, 8.0, 20.0, 400.0, 1e4])
 LIMIT = 9.0
 
 
@@ -40,7 +40,7 @@ def test_where_no_row_is_near_the_limit_it_is_least_squares_at_once():
 
 
 def test_the_cost_is_truncated():
-    assert graduated.truncated(SQUARES, LIMIT) == pytest.approx(0.5 * (0.5 + 3 + 9 + 9 + 9 + 9))
+    assert graduated.truncated(SQUARES, LIMIT) == pytest.approx(0.5 * (0.5 + 3 + 8 + 9 + 9 + 9))
 
 
 @pytest.mark.parametrize("seed", range(20))
