@@ -26,6 +26,7 @@ from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.magnetometer import MagnetometerBuilder
 from smartnav_graph.factors.pose_fix import AttitudeBuilder
 from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.factors.step import StepBuilder
 from smartnav_graph.first_attitude import LONGEST_S, AttitudeStart, attitude_start
 from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
@@ -41,6 +42,7 @@ from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.summary import summarise
 from smartnav_graph.timebase import NS
+from smartnav_graph.walk_start import SPARSE_S, Walk, walked
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -137,7 +139,7 @@ def solve_passes(
     """
     most = problem.config.run.passes + extra_passes(problem.builders)
     precision = FIRST if unsure else problem.config.solve
-    builders = [prior, *problem.builders]
+    builders, first = [prior, *problem.builders], warm
     for count in range(1, most + 1):
         progress("solve", count - 1, most)
         smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
@@ -151,7 +153,7 @@ def solve_passes(
         # Least squares bent by outliers is no start for a redescending loss: settled stretch by stretch it stays near
         # the truth, and a burst stands out against what is foretold.
         cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
-        warm = None if cold else estimate.values
+        warm = first if cold else estimate.values
         memory = learnt
     raise AssertionError("unreachable")
 
@@ -180,8 +182,8 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         most = min(config.max_stretch_s, longest_s)
         config = replace(config, max_stretch_s=most, stretch_s=min(config.stretch_s, most))
 
-    def solve(prior: PriorBuilder, count: int, memory: Memory) -> tuple[Estimate, Memory]:
-        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, memory, unsure=True)
+    def solve(prior: PriorBuilder, count: int, memory: Memory, warm: Any = None) -> tuple[Estimate, Memory]:
+        estimate, memory, _ = solve_passes(problem, problem.windows[:count], prior, memory, warm=warm, unsure=True)
         return estimate, memory
 
     given = Given.parse(problem.config.run.initial) if problem.config.run.initial else None
@@ -200,9 +202,28 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
         weak=problem.config.prior,
         standstill=problem.rests_at_start,
         attitude_start=_oriented(problem, causal=longest_s is not None),
+        walk=_walked(problem, (t_ns, positions), known, config.max_stretch_s if longest_s is not None else None),
         **_north(problem, causal=longest_s is not None),
     )
     return initialiser.run(solve, given)
+
+
+def _walked(problem: Problem, fixes: tuple[Times, Floats], known: Times, causal_s: float | None) -> Walk | None:
+    """First sight of a walker's way, where fixes are far apart; by what is known after `causal_s` seconds."""
+    steps = next((b for b in problem.builders if isinstance(b, StepBuilder)), None)
+    if steps is None or len(fixes[0]) < 2 or float(np.median(np.diff(fixes[0]))) < SPARSE_S * NS:
+        return None
+    end = problem.windows[-1].t1_ns if causal_s is None else problem.windows[0].t1_ns + int(causal_s * NS)
+    used, noise = known <= end, problem.calibration
+    return walked(
+        [window for window in problem.windows if window.t1_ns <= end],
+        steps.steps,
+        (fixes[0][used], fixes[1][used]),
+        max((float(np.median(b.sigma[:, :2])) for b in position_builders(problem.builders)), default=1.0),
+        noise.imu_noise.gyro_bias_sigma,
+        steps.model.body_R_vehicle,
+        noise.step_noise,
+    )
 
 
 def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
@@ -275,6 +296,7 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
         problem.windows,
         initial.prior,
         initial.memory,
+        warm=initial.warm,
         first_s=initial.stretch_s,
         progress=progress,
         clock=clock,

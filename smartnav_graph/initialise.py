@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph import frames
 from smartnav_graph.calibration.model import ImuNoise
-from smartnav_graph.consensus import Agreed, Agreement, curve_of, distinct
+from smartnav_graph.consensus import Agreed, Known, starts_agreed
 from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
 from smartnav_graph.first_attitude import AttitudeStart
@@ -29,6 +29,7 @@ from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.streams import Imu, Magnetometer
 from smartnav_graph.timebase import NS
+from smartnav_graph.walk_start import Walk
 
 Floats = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Initial:
-    """The first state as a prior, what it rests on, and the noise scales found on the way."""
+    """The first state as a prior, what it rests on, the noise scales found on the way, and values to begin from."""
 
     prior: PriorBuilder
     method: str
@@ -110,6 +111,7 @@ class Initial:
     stretch_s: float
     starts: int
     memory: Memory
+    warm: Any = None
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -122,8 +124,8 @@ class Initial:
         }
 
 
-# Solves the first `count` windows from a prior and a memory: the loop of estimate.py, handed down.
-Solve = Callable[[PriorBuilder, int, Memory], tuple[Estimate, Memory]]
+# Solves the first windows (so many) from a prior, a memory and values if there are any: the loop of estimate.py.
+Solve = Callable[[PriorBuilder, int, Memory, Any], tuple[Estimate, Memory]]
 
 
 def _rejections(memory: Memory) -> int:
@@ -138,7 +140,8 @@ class Initialiser:
     sources : sensor and row of each fix; arrival_ns (m,) : when each became known, where that is later
     standstill : factors of their own say that a rest at the start does not move and does not turn
     iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
-    field_start : where north is by the first seconds, where they tell; attitude_start : the attitude that fixes bring
+    field_start : where north is by the first seconds, where they tell; attitude_start : the attitude that fixes bring;
+    walk : a walker's way at first sight
     """
 
     windows: Sequence[Window]
@@ -157,6 +160,7 @@ class Initialiser:
     magnetic_stage: int | None = None
     field_start: FieldStart | None = None
     attitude_start: AttitudeStart | None = None
+    walk: Walk | None = None
     sources: Sequence[tuple[str, int]] = ()
     arrival_ns: NDArray[np.int64] | None = None
 
@@ -183,7 +187,19 @@ class Initialiser:
                     'add a gnss or control stream, or give --initial "e,n,u,heading_deg"',
                 )
             return self._dead_reckoning(rest)
-        return self._search(solve, rest)
+        return self._walked(solve, rest) or self._search(solve, rest)
+
+    def _walked(self, solve: Solve, rest: Rest | None) -> Initial | None:
+        """The start of a walker's way, where the fixes and the inertial data agree with it."""
+        if self.walk is None:
+            return None
+        count = min(self._count(self.config.max_stretch_s), len(self.walk.windows))
+        found, fits = self._attempt(solve, self.walk.state(), Memory(), rest, count, self.walk.values(count))
+        if not fits:
+            return None
+        sentence = found[0][1].sentence.replace("from the fixes", "from the steps, the fixes")
+        whole = self.walk.values() if len(self.walk.windows) == len(self.windows) else None
+        return replace(found[0][1], sentence=sentence, warm=whole)
 
     def _moving(self, start_ns: int, length_s: float) -> bool:
         """Whether the fixes contradict a rest: a line through them with a significant slope, and the slope a walk."""
@@ -333,13 +349,13 @@ class Initialiser:
         return initial.sigma_heading_deg < self.config.good_heading_deg
 
     def _attempt(
-        self, solve: Solve, state: State, memory: Memory, rest: Rest | None, count: int
+        self, solve: Solve, state: State, memory: Memory, rest: Rest | None, count: int, warm: Any = None
     ) -> tuple[list[tuple[float, Initial]], bool]:
         """Cost and start refined from `state`, nothing where it does not converge; whether the kept fixes fit, and
         hardly any was rejected that did not disagree before."""
         outside = _rejections(memory)
         try:
-            estimate, learnt = solve(self._prior(state, rest), count, memory)
+            estimate, learnt = solve(self._prior(state, rest), count, memory, warm)
         except SolverError:
             return [], False
         rejected = _rejections(learnt)
@@ -365,18 +381,14 @@ class Initialiser:
         ends = np.array([w.t1_ns for w in windows])
         used = self._known(int(ends[-1]))
         t_ns, fixes = (column[used] for column in self.fixes)
-        starts = [*before, *self._starts(count, rest)]
         mean, sigma = np.zeros(6), np.array([self.noise.accel_bias_sigma] * 3 + [self.noise.gyro_bias_sigma] * 3)
         if rest is not None:
             mean[3:], sigma[3:] = rest.gyro, max(rest.gyro_sigma, LEAST_RATE_SIGMA)
-        at = starts[0].bias.vector()
-        curve = curve_of(windows, at, self.noise, sigma)
-        rows = np.minimum(np.searchsorted(ends, t_ns), count - 1)
-        problem = Agreement(curve.at(rows), fixes, (t_ns - ends[0]) / NS, self.fix_sigma, self.gravity, mean)
-        agreed: list[Agreed] = []
-        for state in starts:
-            agreed.append(problem.agree(state.nav.attitude().matrix(), state.nav.position(), state.nav.velocity()))
-        chosen = distinct(agreed)[: self.config.starts]
+        known = Known(mean, sigma, self.noise, self.gravity, self.fix_sigma)
+        states = [*before, *self._starts(count, rest)]
+        starts = [(s.nav.attitude().matrix(), s.nav.position(), s.nav.velocity()) for s in states]
+        biases = [states[0].bias.vector()] if before or self.field_start is not None else []
+        chosen = starts_agreed(windows, t_ns, fixes, starts, known, biases)[: self.config.starts]
         return [(self._state_of(a), self._memory_of(a, np.flatnonzero(used))) for a in chosen]
 
     def _state_of(self, agreed: Agreed) -> State:
