@@ -48,14 +48,13 @@ def call(workshop, monkeypatch, capsys):
 def test_smooth_writes_a_run_and_tells_it(call, tmp_path):
     code, out, err = call(f"smooth eight --out {tmp_path}/run --withhold gnss:every=5 {' '.join(FAST)}")
     assert (code, err) == (0, "")
-    assert re.search(r"batch: 20\.0 s, path [\d.]+ m, 21 keyframes", out)
+    assert re.search(r"batch: 20\.0 s, path [\d.]+ m, 22 keyframes", out)
     assert "start: Start given: heading 0.0 deg +- 30 deg" in out
     assert re.search(r"withheld gnss: 16 rows, horizontal RMS [\d.]+ m", out)
-    assert "warning: static: present, not used by the estimator" in out
     assert f"run: {tmp_path}/run (report.html, run.rrd, trajectory.csv, summary.json)" in out
     with (tmp_path / "run" / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 21 and rows[0]["t_ns"] == "1748772000000000000"
+    assert len(rows) == 22 and rows[0]["t_ns"] == "1748772000000000000"
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["evaluation"]["matched"] == 201  # the session's own truth, 10 Hz over 20 s
     assert summary["timings_s"]["load"] > 0
@@ -131,7 +130,7 @@ def test_evaluate_for_people(call):
 def test_export_and_evaluation_of_the_export_is_zero(call, tmp_path):
     assert call(f"export run --format tum --out {tmp_path}/run.tum")[0] == 0
     told = json.loads(call(f"evaluate run --reference {tmp_path}/run.tum --json")[1])
-    assert told["matched"] == 21 and told["ape_m"]["max"] < 1e-9 and told["rotation_deg"]["max"] < 1e-5
+    assert told["matched"] == 22 and told["ape_m"]["max"] < 1e-9 and told["rotation_deg"]["max"] < 1e-5
     for name in ("kml", "gpx", "geojson", "csv"):
         assert call(f"export run --format {name} --out {tmp_path}/run.{name}")[0] == 0
         assert (tmp_path / f"run.{name}").stat().st_size > 1000
@@ -140,7 +139,7 @@ def test_export_and_evaluation_of_the_export_is_zero(call, tmp_path):
 def test_compare_tells_how_far_two_runs_are_apart(call):
     code, out, _ = call("compare run run --json")
     same = json.loads(out)
-    assert code == 0 and same["epochs"] == 21
+    assert code == 0 and same["epochs"] == 22
     assert same["position_m"]["max"] == 0.0 and same["sigma_ratio"]["position"] == 1.0 and same["config"] == {}
     other = json.loads(call("compare run replay --json")[1])
     assert other["sigma_ratio"]["position"] < 1.0  # the replay kept every fix

@@ -12,7 +12,7 @@ from smartnav_graph.config import Config, RunConfig
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.problem import prepare
 from smartnav_graph.simulation.degrade import Degrade, degrade
-from smartnav_graph.simulation.scenarios import simulate
+from smartnav_graph.streams import Temperature
 from smartnav_graph.timebase import NS
 
 
@@ -28,8 +28,11 @@ def run(**options) -> Config:
 def test_a_keyframe_at_every_fix_and_at_the_end(eight):
     problem = prepare(eight, Config())
     times = np.array([window.t1_ns for window in problem.windows])
-    assert np.array_equal(times[:-1], eight.gnss.t_ns) and times[-1] == eight.imu.t_ns[-1]
-    assert [window.index for window in problem.windows] == list(range(61))
+    # and where the rest at the start ends
+    (_, moves), *_ = problem.rests.spans()
+    assert np.array_equal(times[:-1], np.union1d(eight.gnss.t_ns, [moves])) and times[-1] == eight.imu.t_ns[-1]
+    assert [window.index for window in problem.windows] == list(range(62))
+    assert [window.kind for window in problem.windows[:8]] == ["first", *["static"] * 6, "normal"]
     assert problem.windows[0].kind == "first" and problem.windows[0].rows["gnss"].tolist() == [0]
     assert [builder.name for builder in problem.builders] == ["imu", "gnss"]
     assert not problem.dropped and not problem.gaps and problem.vehicle == "none"
@@ -43,9 +46,9 @@ def test_windows_hold_all_inertial_time(eight):
 
 def test_sensors_are_chosen_by_name(eight):
     both = eight.replace(control=on_control(eight, slice(0, None, 10), 0.02, 0))
-    for chosen, names in ((("control",), ["imu", "control"]), (("-gnss",), ["imu", "control"]), ((), None)):
+    for chosen, names in ((("control",), ["imu", "control", "static"]), (("-gnss",), None), ((), None)):
         builders = [builder.name for builder in prepare(both, run(sensors=chosen)).builders]
-        assert builders == (names or ["imu", "gnss", "control"])
+        assert [name for name in builders if name != "gravity"] == (names or ["imu", *(["gnss"] if not chosen else []), "control", "static"])
 
 
 def test_an_unknown_sensor_is_refused(eight):
@@ -84,7 +87,7 @@ def test_leading_and_trailing_dead_reckoning_is_cut_and_told(eight):
     problem = prepare(middle, config)
     assert (problem.windows[0].t1_ns - eight.t0_ns, problem.windows[-1].t1_ns - eight.t0_ns) == (20 * NS, 39 * NS)
     assert any("smoothed from 20.0 to 39.0 s only, 5 s around" in text for text in problem.warnings)
-    assert len(prepare(middle, Config()).windows) == 61  # 60 s of lead reach everywhere
+    assert len(prepare(middle, Config()).windows) == 62  # 60 s of lead reach everywhere
 
 
 def test_gaps_become_windows_of_their_kind(eight):
@@ -101,16 +104,16 @@ def test_gaps_outside_the_stretch_are_not_told_as_gaps(eight):
     assert not prepare(holed, run(end_s=20.0)).gaps
 
 
-def test_streams_without_a_factor_are_told():
-    warnings = prepare(simulate("walk-60s"), Config()).warnings
-    for name in ("magnetometer", "barometer", "static"):
-        assert f"{name}: present, not used by the estimator" in warnings
+def test_streams_without_a_factor_are_told(eight):
+    warm = Temperature(t_ns=eight.imu.t_ns[:2], temperature_c=[20.0, 20.5])
+    warnings = prepare(eight.replace(temperature=warm), Config()).warnings
+    assert "temperature: present, not used by the estimator" in warnings
 
 
 def test_withheld_rows_are_kept_apart(eight):
     problem = prepare(eight, run(withhold=("gnss:every=4",)))
     assert len(problem.session.gnss) == 15 and len(problem.withheld["gnss"]) == 45
-    assert len(problem.windows) == 61  # keyframes no further apart than a second
+    assert len(problem.windows) == 62  # keyframes no further apart than a second
 
 
 def test_without_inertial_data(eight):
