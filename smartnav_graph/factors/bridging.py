@@ -1,15 +1,17 @@
 """Across a gap in the inertial data: what the recording itself tells of how best to bridge it, and how well that goes.
 
-Force and rate are remembered: their mean over a gap is foretold from means over moments before and after it,
+Force and rate are remembered: their mean over a gap, and the slant that a double integral asks for, are foretold from
+what stands before and after it,
 
-    mean over the gap = sum_j w_j x_j,    x = means over 0 - 0.1, 0.1 - 0.3, 0.3 - 0.6 s before the gap and after it,
+    sum_j w_j x_j,    x = the samples at the borders, means over 0 - 0.1, 0.1 - 0.3, 0.3 - 0.6 s before and after,
 
-axis by axis, with the weights that served best on the honest stretches of the same recording, each of which is bridged
-as if it were a gap (ridge regression towards equal weights). What is left there, by leaving out one stretch at a time,
-is the noise of the bridge. Vibration asks for long means, a turn for a slope: the recording knows.
+axis by axis, with the weights that serve best on the honest stretches of the same recording, each of which is bridged
+as if it were a gap (ridge regression towards the mean of all looks or the straight line between the borders). What is
+left where the weights were not learnt, part by part of the recording, is the noise of the bridge. Vibration asks for
+long means, a turn for a slope: the recording knows.
 
 Source: Priestley (1981), Spectral Analysis and Time Series, 10.3, on linear interpolation; Hastie, Tibshirani, Friedman
-(2009), The Elements of Statistical Learning, 7.10, on leaving one out.
+(2009), The Elements of Statistical Learning, 3.4 and 7.10, on ridge regression and cross-validation.
 """
 
 from __future__ import annotations
@@ -30,22 +32,22 @@ Floats = NDArray[np.float64]
 MOMENTS = ((0.0, 0.1), (0.1, 0.3), (0.3, 0.6))
 # Honest stretches that weights are found from, at least and at most.
 LEAST, MOST = 30, 2000
-# Weight of equal weights, in stretches of typical size.
-RIDGE = 1e-2
-# Share of its own truth that a stretch may tell.
-MOST_LEVERAGE = 0.9
+# How many stretches weigh as much as what weights are drawn to: the best is taken.
+RIDGES = (1e-2, 1.0, 1e6)
+# Parts of the recording, each of which is bridged by what the others teach.
+FOLDS = 6
 # A bridge is never surer than so many times honest data; so many times where there is nothing to learn from.
 FLOOR, UNKNOWN = 3.0, 30.0
 
 
 @dataclass(frozen=True)
 class Bridge:
-    """Noise densities (3,) accel m/s^2/sqrt(Hz) and gyro rad/s/sqrt(Hz) across a gap; mean (6,) of force m/s^2 and rate
-    rad/s over it, None where nothing is known and a straight line has to do."""
+    """Noise densities (3,) accel m/s^2/sqrt(Hz) and gyro rad/s/sqrt(Hz) across a gap; told (2, 6) : mean and slant of
+    force m/s^2 and rate rad/s over it, None where nothing is known and a straight line has to do."""
 
     accel: Floats
     gyro: Floats
-    mean: Floats | None = None
+    told: Floats | None = None
 
 
 class Recorded:
@@ -56,6 +58,8 @@ class Recorded:
         self.signal = np.concatenate([imu.accel, imu.gyro], axis=1)
         steps = 0.5 * (self.signal[1:] + self.signal[:-1]) * np.diff(self.t)[:, None]
         self.integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])
+        middle = 0.5 * (self.t[1:] + self.t[:-1])[:, None]
+        self.first = np.concatenate([np.zeros((1, 6)), np.cumsum(middle * steps, axis=0)])  # integral of t times signal
         inside = np.zeros(len(self.t))  # of the interval that ends at each sample
         for gap in gaps:
             inside[np.searchsorted(imu.t_ns, gap.start_ns) + 1 : np.searchsorted(imu.t_ns, gap.end_ns) + 1] = 1.0
@@ -68,6 +72,13 @@ class Recorded:
     def mean(self, start: Floats, end: Floats) -> Floats:
         """Means (m, 6) of force and rate from `start` (m,) to `end` (m,) s."""
         return np.asarray((self.at(self.integral, end) - self.at(self.integral, start)) / (end - start)[:, None])
+
+    def slant(self, start: Floats, end: Floats) -> Floats:
+        """Means (m, 6) of (2 x - 1) times force and rate, x from 0 at `start` (m,) to 1 at `end`."""
+        length = (end - start)[:, None]
+        lever = self.at(self.first, end) - self.at(self.first, start)
+        middle = 0.5 * (start + end)[:, None]
+        return np.asarray(2.0 * (lever / length - middle * self.mean(start, end)) / length)
 
     def honest(self, start: Floats, end: Floats) -> NDArray[np.bool_]:
         """Mask (m,) of the stretches inside the recording without a gap."""
@@ -96,16 +107,18 @@ def _seen(recorded: Recorded, start: Floats, end: Floats, looks: Sequence[Look])
 
 @dataclass(frozen=True)
 class Learnt:
-    """level (6,) that all counts from; weights (6, k) of the looks by axis; error (6,) rms of the mean over the gap, as
-    it serves stretches not seen."""
+    """How mean and slant over a gap follow from the looks: level (6,) that all counts from, weights (2, 6, k) by axis;
+    density (6,) of noise that covers what was left where they were not learnt."""
 
     level: Floats
     weights: Floats
-    error: Floats
+    density: Floats
 
-    def mean(self, seen: Floats) -> Floats:
-        """The foretold mean (6,) of what the looks (6, k) show."""
-        return np.asarray(self.level + np.einsum("ak,ak->a", self.weights, seen - self.level[:, None]))
+    def told(self, seen: Floats) -> Floats:
+        """Mean and slant (2, 6) by what the looks (6, k) show."""
+        found = np.einsum("jak,ak->ja", self.weights, seen - self.level[:, None])
+        found[0] += self.level
+        return np.asarray(found)
 
 
 def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt | None:
@@ -115,27 +128,74 @@ def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt |
     start = start[recorded.honest(start - REACH, start + length + REACH)]
     if len(start) < LEAST:
         return None
-    truth, seen = recorded.mean(start, start + length), _seen(recorded, start, start + length, looks)
-    level = truth.mean(axis=0)
-    weights, error = zip(
-        *(_ridge(y, x) for y, x in zip((truth - level).T, _by_axis(seen, level), strict=True)), strict=True
-    )
-    return Learnt(level, np.array(weights), np.array(error))
+    end = start + length
+    mean, slant, seen = recorded.mean(start, end), recorded.slant(start, end), _seen(recorded, start, end, looks)
+    level = mean.mean(axis=0)
+    fold, apart = _folds(start, length + 2.0 * REACH)
+    x = (seen - level[:, None]).transpose(1, 0, 2)
+    best = [
+        [_best(y, rows, fold, apart, targets) for y, rows in zip(truth.T, x, strict=True)]
+        for truth, targets in ((mean - level, _flat(looks)), (slant, _slanting(looks)))
+    ]
+    weights, error = (np.array([[pair[i] for pair in axes] for axes in best]) for i in range(2))
+    return Learnt(level, weights, _density(recorded, start, end, error.transpose(0, 2, 1)))
 
 
-def _by_axis(seen: Floats, level: Floats) -> Floats:
-    return np.asarray((seen - level[:, None]).transpose(1, 0, 2))
+def _density(recorded: Recorded, start: Floats, end: Floats, error: Floats) -> Floats:
+    """Density (6,) of white noise that covers the errors (2, m, 6) of mean and slant: of the integral over the gap, of
+    the double integral, and of the integral over the gap's first half."""
+    mean, slant = recorded.mean(start, end) - error[0], recorded.slant(start, end) - error[1]
+    first, last = recorded.at(recorded.signal, start), recorded.at(recorded.signal, end)
+    half = 0.5 * mean - (last - first) / 8.0 - 30.0 / 32.0 * (slant - (last - first) / 6.0)
+    missed = 0.5 * recorded.mean(start, 0.5 * (start + end)) - half
+    by_mean, by_slant, by_half = ((e**2).mean(axis=0) for e in (*error, missed))
+    worst = np.max([by_mean, 0.75 * (by_mean + by_slant), 2.0 * by_half], axis=0)
+    return np.asarray(np.sqrt(worst * float(np.mean(end - start))))
 
 
-def _ridge(y: Floats, x: Floats) -> tuple[Floats, float]:
-    """Weights (k,) for y (m,) from x (m, k), drawn towards equal ones, and the rms of y left out one at a time."""
-    count = x.shape[1]
-    normal, equal = x.T @ x, np.full(count, 1.0 / count)
-    size = max(float(np.trace(normal)) / len(x), 1e-30)
-    hat = np.linalg.solve(normal + RIDGE * size * np.eye(count), x.T)
-    weights = equal + hat @ (y - x @ equal)
-    leverage = np.minimum(np.einsum("nk,kn->n", x, hat), MOST_LEVERAGE)
-    return weights, float(np.sqrt((((y - x @ weights) / (1.0 - leverage)) ** 2).mean()))
+def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Fold (m,) of every stretch, contiguous in time, and which stretches (folds, m) share nothing with each fold."""
+    edges = np.linspace(start[0], start[-1], FOLDS + 1)
+    fold = np.clip(np.searchsorted(edges, start, side="right") - 1, 0, FOLDS - 1)
+    apart = (start < edges[:-1, None] - reach) | (start > edges[1:, None] + reach)
+    return fold, apart
+
+
+def _flat(looks: Sequence[Look]) -> list[Floats]:
+    """What the weights of a mean are drawn to: the mean of all looks, or the straight line between the borders."""
+    border = np.array([float(a == b) for _, a, b in looks])
+    return [np.full(len(looks), 1.0 / len(looks)), border / border.sum()]
+
+
+def _slanting(looks: Sequence[Look]) -> list[Floats]:
+    """The same of a slant: none, or that of the straight line."""
+    border = np.array([side * float(a == b) for side, a, b in looks])
+    return [np.zeros(len(looks)), border / 6.0]
+
+
+def _best(
+    y: Floats, x: Floats, fold: NDArray[np.intp], apart: NDArray[np.bool_], targets: Sequence[Floats]
+) -> tuple[Floats, Floats]:
+    """Weights (k,) for y (m,) from x (m, k) that serve best where they have not been learnt, and their errors (m,)."""
+    tried = []
+    for target in targets:
+        for ridge in RIDGES:
+            error = np.empty(len(y))
+            for k, train in enumerate(apart):
+                rows = fold == k
+                error[rows] = y[rows] - x[rows] @ _ridge(y[train], x[train], target, ridge)
+            tried.append((float((error**2).mean()), target, ridge, error))
+    _, target, ridge, error = min(tried, key=lambda item: item[0])
+    return _ridge(y, x, target, ridge), error
+
+
+def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
+    """Weights (k,) for y (m,) from x (m, k), drawn to `target` with the weight of `ridge` stretches."""
+    if not len(y):
+        return target
+    normal = x.T @ x
+    pull = ridge * max(float(np.trace(normal)) / len(x), 1e-30) * np.eye(len(target))
+    return np.asarray(target + np.linalg.solve(normal + pull, x.T @ (y - x @ target)))
 
 
 def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> dict[int, Bridge]:
@@ -165,25 +225,25 @@ def _bridge(recorded: Recorded, gap: Gap, imu: Imu, floor: ImuNoise) -> Bridge:
     while span > 2 * float(np.median(np.diff(recorded.t))):
         learnt = _learn(recorded, span, looks)
         if learnt is not None:
-            density = np.maximum(learnt.error * np.sqrt(span), FLOOR * least)
-            return Bridge(density[:3], density[3:], learnt.mean(_seen(recorded, start, end, looks)[0]))
+            density = np.maximum(learnt.density, FLOOR * least)
+            return Bridge(density[:3], density[3:], learnt.told(_seen(recorded, start, end, looks)[0]))
         span /= 2
     return Bridge(UNKNOWN * least[:3], UNKNOWN * least[3:])
 
 
 def bridged(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> Imu:
-    """The inertial data with a curve of the foretold mean across every gap: the straight line between its borders and a
-    parabola on it. Where no samples are, the curve is sampled at the recording's own rate."""
+    """The inertial data with a curve of the foretold mean and slant across every gap: the straight line between its
+    borders and a cubic on it. Where no samples are, the curve is sampled at the recording's own rate."""
     if not gaps:
         return imu
     found, recorded = bridges(imu, gaps, floor, causal=causal), Recorded(imu, gaps)
     t_ns = np.unique(np.concatenate([imu.t_ns, *(_inner(gap, imu) for gap in gaps if gap.kind == "missing")]))
     signal = recorded.at(recorded.signal, (t_ns - int(imu.t_ns[0])) / NS)
     for gap in gaps:
-        mean = found[gap.start_ns].mean
+        told = found[gap.start_ns].told
         inside = slice(*np.searchsorted(t_ns, [gap.start_ns, gap.end_ns + 1]))
-        if mean is not None:
-            signal[inside] = _curve(t_ns[inside], signal[inside][0], signal[inside][-1], mean)
+        if told is not None:
+            signal[inside] = _curve(t_ns[inside], signal[inside][0], signal[inside][-1], told)
     return Imu(t_ns=t_ns, accel=signal[:, :3], gyro=signal[:, 3:])
 
 
@@ -193,7 +253,9 @@ def _inner(gap: Gap, imu: Imu) -> NDArray[np.int64]:
     return np.arange(gap.start_ns + period, gap.end_ns, period, dtype=np.int64)
 
 
-def _curve(t_ns: NDArray[np.int64], first: Floats, last: Floats, mean: Floats) -> Floats:
-    """Values (m, 6) from `first` to `last` (6,) with the mean asked for."""
+def _curve(t_ns: NDArray[np.int64], first: Floats, last: Floats, told: Floats) -> Floats:
+    """Values (m, 6) from `first` to `last` (6,) with the mean and the slant asked for."""
     x = ((t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0]))[:, None]
-    return np.asarray((1.0 - x) * first + x * last + 6.0 * x * (1.0 - x) * (mean - 0.5 * (first + last)))
+    mean, slant = told
+    bump = 6.0 * (mean - 0.5 * (first + last)) - 30.0 * (1.0 - 2.0 * x) * (slant - (last - first) / 6.0)
+    return np.asarray((1.0 - x) * first + x * last + x * (1.0 - x) * bump)
