@@ -36,7 +36,7 @@ MOST = 5.0
 # No device is a factor of more than this from what is known of its class.
 WIDEST = 10.0
 # Normalised square at which fixes contradict their sigma.
-CONTRADICTION = 1.5
+CONTRADICTION = 2.0
 # The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.
 RELAXATION = 1.5
 # Groups of noise and their fields in `calibration.model.ImuNoise`.
@@ -64,6 +64,8 @@ class Component(NamedTuple):
         blamed = level < CONTRADICTION or self.square > level * self.redundancy
         square = self.square if blamed else min(self.square, self.redundancy)
         wanted = np.sqrt((before**2 * square + weight) / (self.redundancy + weight))
+        if abs(np.log(wanted / before)) < 0.5 / np.sqrt(2.0 * (self.redundancy + weight)):
+            return before  # half of what the data leave open
         step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
         return float(np.clip(before * step, 1.0 / WIDEST, WIDEST))
 
