@@ -36,7 +36,7 @@ SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
 # rest on few degrees of freedom and creep.
 STEADY = 0.1
-STEADY_INERTIAL = 0.2
+STEADY_INERTIAL = 0.1
 
 
 # A session state is held where the data leave more than this of its prior sigma.
