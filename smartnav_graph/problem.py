@@ -146,8 +146,8 @@ def cut(
 
 
 def recut(problem: Problem, known_ns: int | None = None) -> Problem:
-    """The same stretch as batch sees it: every row at the time it speaks of, gaps bridged by all that was recorded; only
-    rows known by `known_ns` where that is given. The problem itself where that is no difference."""
+    """The same stretch as batch sees it: every row at the time it speaks of, gaps bridged by all that was recorded.
+    Only rows known by `known_ns` where that is given; the problem itself where there is no difference."""
     session, config, gaps = problem.session, problem.config, problem.gaps
     merge = round(config.keyframes.merge_s * NS)
     streams = [stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None]

@@ -206,7 +206,7 @@ def test_without_a_loss_a_late_row_is_least_squares():
 
 @pytest.mark.parametrize("smoother", ["isam2", "fixed-lag"])
 def test_a_gap_is_bridged_by_what_came_before(smoother):
-    """Rougher motion after 42 s teaches batch to trust the bridge less; a replay that was past it knows nothing of it."""
+    """Rougher motion after 42 s teaches batch to trust the bridge less; a replay was past it by then."""
     session = recorded()
     seconds = session.seconds(session.imu.t_ns)
     session = session.replace(imu=session.imu.take((seconds < 36.0) | (seconds > 37.5)))

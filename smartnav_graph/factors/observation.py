@@ -207,7 +207,7 @@ class AtInstant:
         pose, velocity, *rest = states
         at = _unpack(data[:, self.observation.width :])
         bias = at["bias"] if self.short else rest.pop(0)
-        there = _foretold(pose, velocity, bias, at)
+        there = _present(pose, velocity) if self.short else _foretold(pose, velocity, bias, at)
         clock: list[Floats] = []
         if self.timed:
             offset = rest.pop(0)
@@ -235,6 +235,14 @@ def _unpack(columns: Floats) -> dict[str, Floats]:
         out[name] = columns[:, start : start + width]
         start += width
     return out
+
+
+def _present(pose: Floats, velocity: Floats) -> _There:
+    """At the keyframe itself."""
+    R, eye = pose[:, :3, :3], np.eye(3)
+    by_pose, by_velocity, by_bias = (np.zeros((len(pose), 9, n)) for n in (6, 3, 6))
+    by_pose[:, :3, :3], by_pose[:, 3:6, 3:], by_velocity[:, 6:9] = eye, R, eye
+    return _There(R, pose[:, :3, 3], velocity, (by_pose, by_velocity, by_bias))
 
 
 def _foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> _There:
