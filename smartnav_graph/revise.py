@@ -39,6 +39,10 @@ STEADY = 0.1
 STEADY_INERTIAL = 0.1
 
 
+# Growth of the control a pass from a warm start, and the most passes that takes.
+GROWTH = 4.0
+GRADUATED_PASSES = 14
+
 # A session state is held where the data leave more than this of its prior sigma.
 OBSERVED = 0.7
 
@@ -103,14 +107,14 @@ class Verdict:
 
     def outside(self, probability: float | None = None) -> frozenset[int]:
         """Rows beyond the gate, at the robust level of all rows."""
-        level = float(np.median(self.square)) / float(chi2(self.dim).median())
-        return np.asarray(self.square / self.limit(level, probability))
-
-
         return frozenset(int(row) for row in self.rows[self.relative(probability) > 1.0])
 
     def relative(self, probability: float | None = None) -> Floats:
         """Squares (m,) in units of the gate's."""
+        level = float(np.median(self.square)) / float(chi2(self.dim).median())
+        return np.asarray(self.square / self.limit(level, probability))
+
+
 def verdicts(
     builders: Iterable[Builder], found: Mapping[str, FixResiduals], estimate: Estimate, memory: Memory
 ) -> list[Verdict]:
@@ -180,10 +184,6 @@ def revise(
     return grown, grown == tuned
 
 
-def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:
-    """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
-    positions = position_builders(builders)
-    wandering = frozenset(b.name for b in positions if b.wanders(memory))
 def _graduated(judged: Sequence[Verdict], memory: Memory) -> Memory | None:
     """The memory with the weights of the next control; None where every weight is settled, or none is asked for."""
     asked = [v for v in judged if v.graduated]
@@ -207,6 +207,10 @@ def extra_passes(builders: Iterable[Builder]) -> int:
     return GRADUATED_PASSES if any(b.config.loss == "gnc" for b in position_builders(builders)) else 0
 
 
+def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:
+    """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
+    positions = position_builders(builders)
+    wandering = frozenset(b.name for b in positions if b.wanders(memory))
     if memory.stage < LAST_STAGE:
         later = any(b.stage == LAST_STAGE or (hasattr(b, "grows") and b.grows(memory)) for b in builders)
         return replace(memory, stage=LAST_STAGE, correlated=wandering) if later else memory
