@@ -36,6 +36,10 @@ PROBABILITY = 0.999
 GROWTH = 1.4  # of the control, a step
 STEPS = 80
 MOST_FIXES = 300
+SHORT_S, LEAST_FIXES = 12.0, 6  # the first seconds
+MOVED = 0.01  # rad/s, by which a rate may be off where the curve was integrated
+ROUNDS = 3  # integrations, each at the bias found by the one before
+BEST = 3  # states that the curve is integrated once more for
 ALIKE = 0.2  # rad, between starts that lead to the same solution
 FIRST_STEPS = 5
 DAMPING = (1e-9, 1e-3, 1e-1, 1e1, 1e3)
@@ -207,6 +211,90 @@ def _agree(problem: Agreement, R: Floats, p: Floats, v: Floats) -> Agreed:
             break
         mu *= GROWTH
     return state
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before: mean and sigma (6,) of the biases, noise of the inertial data, gravity m/s^2, and one sigma
+    of the fixes, m."""
+
+    bias_mean: Floats
+    bias_sigma: Floats
+    noise: ImuNoise
+    gravity: float
+    fix_sigma: float
+
+
+def starts_agreed(
+    windows: Sequence[Window],
+    t_ns: NDArray[np.int64],
+    fixes: Floats,
+    starts: Sequence[tuple[Floats, Floats, Floats]],
+    known: Known,
+    biases: Sequence[Floats] = (),
+) -> list[Agreed]:
+    """The different states that most fixes (m, 3) at t_ns (m,) agree on, cheapest first, from starts (attitude,
+    position, velocity). The curve is integrated at the bias known before, at those of `biases` (6,), and at that of the
+    first seconds, because a rate wrong by degrees a second bends it beyond what a derivative tells; and for the best
+    once more at the bias they found."""
+    points = [*biases, known.bias_mean][:1]
+    first = _first_bias(windows, t_ns, fixes, starts, known)
+    if _far(first, points):
+        points.append(first)
+    found = distinct([state for at in points for state in _agreed_at(at, windows, t_ns, fixes, starts, known)])
+    again = []
+    for state in found[:BEST]:
+        for _ in range(ROUNDS - 1):
+            if _far(state.found[:6], points):
+                points.append(state.found[:6])
+                start = (state.R, state.p, state.v)
+                state = _agreed_at(state.found[:6], windows, t_ns, fixes, [start], known)[0]
+        again.append(state)
+    return distinct([*again, *found[BEST:]])
+
+
+def _far(bias: Floats, points: Sequence[Floats]) -> bool:
+    """Whether a curve integrated at one of `points` (6,) is not to be trusted at another bias (6,)."""
+    return all(np.abs(bias - point)[3:].max() > MOVED for point in points)
+
+
+def _first_bias(
+    windows: Sequence[Window],
+    t_ns: NDArray[np.int64],
+    fixes: Floats,
+    starts: Sequence[tuple[Floats, Floats, Floats]],
+    known: Known,
+) -> Floats:
+    """Biases (6,) by the first seconds, in which even a bad rate turns the curve little."""
+    ends = np.array([w.t1_ns for w in windows])
+    short = int(np.searchsorted(ends, max(int(t_ns[0]), int(ends[0])) + round(SHORT_S * NS), side="right"))
+    early = t_ns <= ends[max(short - 1, 0)]
+    bias = known.bias_mean
+    if early.sum() < LEAST_FIXES or short >= len(windows):
+        return bias
+    for _ in range(ROUNDS):
+        before = bias
+        states = _agreed_at(bias, windows[:short], t_ns[early], fixes[early], starts, known)
+        bias = min(states, key=lambda state: state.cost).found[:6]
+        if not _far(bias, [before]):
+            break
+    return bias
+
+
+def _agreed_at(
+    bias: Floats,
+    windows: Sequence[Window],
+    t_ns: NDArray[np.int64],
+    fixes: Floats,
+    starts: Sequence[tuple[Floats, Floats, Floats]],
+    known: Known,
+) -> list[Agreed]:
+    ends = np.array([w.t1_ns for w in windows])
+    curve = curve_of(windows, bias, known.noise, known.bias_sigma)
+    rows = np.minimum(np.searchsorted(ends, t_ns), len(windows) - 1)
+    t = (t_ns - ends[0]) / NS
+    problem = Agreement(curve.at(rows), fixes, t, known.fix_sigma, known.gravity, known.bias_mean)
+    return [problem.agree(*start) for start in starts]
 
 
 def distinct(states: Sequence[Agreed]) -> list[Agreed]:

@@ -380,7 +380,7 @@ class Initialiser:
         windows = self.windows[:count]
         ends = np.array([w.t1_ns for w in windows])
         used = self._known(int(ends[-1]))
-        t_ns, fixes = (column[used] for column in self.fixes)
+        t_ns, fixes = self.fixes[0][used], self.fixes[1][used]
         mean, sigma = np.zeros(6), np.array([self.noise.accel_bias_sigma] * 3 + [self.noise.gyro_bias_sigma] * 3)
         if rest is not None:
             mean[3:], sigma[3:] = rest.gyro, max(rest.gyro_sigma, LEAST_RATE_SIGMA)
