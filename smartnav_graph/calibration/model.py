@@ -123,8 +123,8 @@ DEVICE_CLASSES: dict[str, ImuNoise] = {
 class MagnetometerNoise:
     """Errors of a magnetometer, uT: reading = nav_R_body^T (field + disturbance) + hard iron + white, before soft iron.
 
-    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : what iron nearby adds to the Earth's field as the
-    device moves, and how long it stays alike
+    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : what iron nearby adds to the Earth's field as
+    the device moves, and how long it stays alike
     hard_iron_ut : constant offset in body axes, hard_iron_sigma_ut : how sure; that of a phone whose system calibrates
     soft_iron : row-major (3, 3), the corrected reading is soft_iron (reading - hard iron)
     """
