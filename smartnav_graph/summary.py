@@ -17,7 +17,7 @@ from smartnav_graph.graph import Memory
 from smartnav_graph.initialise import Initial
 from smartnav_graph.problem import Problem
 from smartnav_graph.rejections import rejections
-from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.revise import OBSERVED, fix_residuals, position_builders
 from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
@@ -171,6 +171,8 @@ def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, d
             "sigma": spread[0] if alone else spread,
             "held": state.held,
         }
+        if not alone and not state.held:
+            found[state.name]["observed"] = (state.sigma < OBSERVED * state.prior_sigma).tolist()
     found |= _inertial_noise(problem, memory) | _row_noise(problem, memory)
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:

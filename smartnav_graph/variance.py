@@ -23,9 +23,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.factors import scale
 from smartnav_graph.factors.imu import ImuBuilder, accel_part, integration_part
 from smartnav_graph.graph import Builder, Memory, Window
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.whole_graph import Stack
 
 Floats = NDArray[np.float64]
 
@@ -101,19 +103,45 @@ def components(
     return found
 
 
-def _factors(windows: Sequence[Window], rows: NDArray[np.intp], estimate: Estimate) -> _Factors:
+class _Linear(NamedTuple):
+    """Inertial rows by window: whitened residual (m, 9), derivatives by pose, velocity and bias before (m, 9, 15) and
+    by pose and velocity after (m, 9, 9), and the whitening root (m, 9, 9)."""
+
+    residual: Floats
+    before: Floats
+    after: Floats
+    root: Floats
+
+
+def _native(windows: Sequence[Window], estimate: Estimate) -> _Linear:
     by_time = {tag.t_ns: factor for tag, factor in estimate.factors if tag.sensor == "imu"}
     factors = [by_time[w.t1_ns] for w in windows]
     pairs = [factor.linearize(estimate.values).jacobian() for factor in factors]
     A = np.array([jacobian for jacobian, _ in pairs])  # pose, velocity; pose, velocity after; bias
-    before, after = np.concatenate([A[:, :, :9], A[:, :, 18:]], axis=2), A[:, :, 9:18]
+    before = np.concatenate([A[:, :, :9], A[:, :, 18:]], axis=2)
+    root = np.array([factor.noiseModel().R() for factor in factors])
+    return _Linear(-np.array([b for _, b in pairs]), before, A[:, :, 9:18], root)
+
+
+def _scaled(stack: Stack, windows: Sequence[Window], estimate: Estimate) -> _Linear:
+    """Of windows whose scale factors are states; that these move the residuals too is left out, they are few."""
+    residual, (pose, velocity, pose_j, velocity_j, bias, _) = stack.linearize(estimate.values)
+    place = {block.t_ns: row for row, block in enumerate(stack.blocks)}
+    rows = [place[w.t1_ns] for w in windows]
+    before, after = np.concatenate([pose, velocity, bias], axis=2), np.concatenate([pose_j, velocity_j], axis=2)
+    root = scale.unpacked(stack.data)["root"].reshape(-1, 9, 9)
+    return _Linear(residual[rows], before[rows], after[rows], root[rows])
+
+
+def _factors(windows: Sequence[Window], rows: NDArray[np.intp], estimate: Estimate) -> _Factors:
+    stacks = estimate.stacks("imu")
+    residual, before, after, root = _scaled(stacks[0], windows, estimate) if stacks else _native(windows, estimate)
     marginals = estimate.marginals
     mixed = before @ marginals.following[rows - 1][:, :, :9] @ after.transpose(0, 2, 1)
     carried = before @ marginals.joint[rows - 1] @ before.transpose(0, 2, 1)
     carried += after @ marginals.joint[rows][:, :9, :9] @ after.transpose(0, 2, 1)
     carried += mixed + mixed.transpose(0, 2, 1)
-    root = np.array([factor.noiseModel().R() for factor in factors])
-    return _Factors(windows, -np.array([b for _, b in pairs]), np.eye(9) - carried, root)
+    return _Factors(windows, residual, np.eye(9) - carried, root)
 
 
 def _white(builder: ImuBuilder, factors: _Factors, memory: Memory) -> dict[str, Component]:

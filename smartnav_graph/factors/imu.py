@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import bridging
+from smartnav_graph.factors import bridging, scale
 from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
+from smartnav_graph.graph import LAST_STAGE, Memory, State, Step, Tag, Window, key
 from smartnav_graph.timebase import Gap
 
 Floats = NDArray[np.float64]
@@ -44,15 +44,19 @@ CALIBRATED_WEIGHT = 100.0
 @dataclass(frozen=True)
 class ImuConfig:
     """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging;
-    estimate_noise : find noise densities and bias walks from the kept data (batch)."""
+    estimate_noise : find noise densities and bias walks from the kept data (batch); scale_sigma : prior of every
+    element of scale and misalignment as a state (0.01 is usual of phones; zero: calibrated, or none)."""
 
     integration_sigma: float = 1e-3
     gap_factor: float = 1.0
     estimate_noise: bool = True
+    scale_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.integration_sigma > 0 and self.gap_factor > 0):
             raise ConfigError("config [imu]", "integration_sigma or gap_factor <= 0", "> 0")
+        if not 0 <= self.scale_sigma < 0.2:
+            raise ConfigError("config [imu]", f"scale_sigma = {self.scale_sigma}", "between 0 and 0.2")
 
 
 def accel_part(windows: Sequence[Window], density: float) -> Floats:
@@ -110,8 +114,8 @@ class ImuBuilder:
     _kept: dict[int, Kept] = field(default_factory=dict)
 
     def grows(self, memory: Memory) -> bool:
-        """Whether there is more to learn once the trajectory is found: the noise."""
-        return self.config.estimate_noise
+        """Whether there is more to learn once the trajectory is found: the noise, scale factors."""
+        return self.config.estimate_noise or self.config.scale_sigma > 0
 
     def params(self, memory: Memory, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -165,18 +169,25 @@ class ImuBuilder:
         seconds, self._spent_s = self._spent_s, 0.0
         return seconds
 
-    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.NoiseModelFactor:
-        """Factor of a window with the noise of `memory`, whatever noise it was preintegrated with."""
-        i, j = window.index - 1, window.index
-        factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
-        scales, old = (memory.scale("accel"), memory.scale("gyro")), self._kept[j].scales
+    def _covariance(self, window: Window, pim: Any, memory: Memory) -> Floats:
+        """Covariance (9, 9) of a window with the noise of `memory`, whatever noise it was preintegrated with."""
+        scales, old = (memory.scale("accel"), memory.scale("gyro")), self._kept[window.index].scales
+        covariance: Floats = pim.preintMeasCov()
         if scales == old:
-            return factor
+            return covariance
         accel = accel_part([window], self.noise.accel_noise_density)[0]
         integration = integration_part([window], self.config.integration_sigma)[0]
-        gyro = (pim.preintMeasCov() - old[0] ** 2 * accel - integration) / old[1] ** 2
-        covariance = scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration
-        return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.Covariance(covariance))
+        gyro = (covariance - old[0] ** 2 * accel - integration) / old[1] ** 2
+        return np.asarray(scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration)
+
+    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.NoiseModelFactor:
+        """Factor of a window with the noise of `memory`."""
+        i, j = window.index - 1, window.index
+        factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
+        if (memory.scale("accel"), memory.scale("gyro")) == self._kept[j].scales:
+            return factor
+        model = gtsam.noiseModel.Gaussian.Covariance(self._covariance(window, pim, memory))
+        return factor.cloneWithNewNoiseModel(model)
 
     def _params_of(self, window: Window, memory: Memory) -> gtsam.PreintegrationParams:
         bridge = self._bridge(window)
@@ -214,8 +225,12 @@ class ImuBuilder:
                 return None
             return self._factor(window, self.preintegrate(window, bias, memory), memory)
 
-        step.refresh = refresh
-        step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
+        if self.config.scale_sigma > 0 and memory.stage == LAST_STAGE and window.kind != "gap":
+            covariance = self._covariance(window, pim, memory)
+            scale.add(step, window, previous.bias, covariance, self.gravity, self.config.scale_sigma)
+        else:
+            step.refresh = refresh
+            step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
         root = np.sqrt(window.length_s)
         walk = self.walk_sigma(memory) * root
         step.add(

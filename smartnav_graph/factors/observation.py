@@ -207,7 +207,7 @@ class AtInstant:
         pose, velocity, *rest = states
         at = _unpack(data[:, self.observation.width :])
         bias = at["bias"] if self.short else rest.pop(0)
-        there = _present(pose, velocity) if self.short else _foretold(pose, velocity, bias, at)
+        there = _present(pose, velocity) if self.short else foretold(pose, velocity, bias, at)
         clock: list[Floats] = []
         if self.timed:
             offset = rest.pop(0)
@@ -220,7 +220,7 @@ class AtInstant:
 
 
 @dataclass(frozen=True)
-class _There:
+class There:
     """State at the instant; by : derivatives (m, 9, n) by pose, velocity and bias."""
 
     R: Floats
@@ -237,18 +237,19 @@ def _unpack(columns: Floats) -> dict[str, Floats]:
     return out
 
 
-def _present(pose: Floats, velocity: Floats) -> _There:
+def _present(pose: Floats, velocity: Floats) -> There:
     """At the keyframe itself."""
     R, eye = pose[:, :3, :3], np.eye(3)
     by_pose, by_velocity, by_bias = (np.zeros((len(pose), 9, n)) for n in (6, 3, 6))
     by_pose[:, :3, :3], by_pose[:, 3:6, 3:], by_velocity[:, 6:9] = eye, R, eye
-    return _There(R, pose[:, :3, 3], velocity, (by_pose, by_velocity, by_bias))
+    return There(R, pose[:, :3, 3], velocity, (by_pose, by_velocity, by_bias))
 
 
-def _foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> _There:
-    """By the partial preintegration, corrected to first order for the bias."""
-    m = len(pose)
-    by_bias = at["by_bias"].reshape(m, 9, 6)
+def foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> There:
+    """By the partial preintegration, corrected to first order for the bias (m, 6), or for whatever its derivatives
+    `by_bias` go by."""
+    m, size = bias.shape
+    by_bias = at["by_bias"].reshape(m, 9, size)
     change = turned(by_bias, bias - at["bias"])
     turn = exp(change[:, :3])
     dR = at["dR"].reshape(m, 3, 3) @ turn
@@ -257,7 +258,7 @@ def _foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats
     fall = np.array([0.0, 0.0, -1.0]) * at["gravity"]
     p = pose[:, :3, 3] + velocity * dt + 0.5 * fall * dt**2 + turned(Ri, dp)
     v = velocity + fall * dt + turned(Ri, dv)
-    by_pose, by_velocity, by_b = np.zeros((m, 9, 6)), np.zeros((m, 9, 3)), np.zeros((m, 9, 6))
+    by_pose, by_velocity, by_b = np.zeros((m, 9, 6)), np.zeros((m, 9, 3)), np.zeros((m, 9, size))
     by_pose[:, :3, :3] = dR.transpose(0, 2, 1)
     by_pose[:, 3:6, :3] = -Ri @ skew(dp)
     by_pose[:, 3:6, 3:] = Ri
@@ -266,10 +267,10 @@ def _foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats
     by_velocity[:, 6:9] = np.eye(3)
     by_b[:, :3] = (np.eye(3) - 0.5 * skew(change[:, :3])) @ by_bias[:, :3]
     by_b[:, 3:6], by_b[:, 6:9] = Ri @ by_bias[:, 3:6], Ri @ by_bias[:, 6:9]
-    return _There(Ri @ dR, p, v, (by_pose, by_velocity, by_b))
+    return There(Ri @ dR, p, v, (by_pose, by_velocity, by_b))
 
 
-def _delayed(there: _There, bias: Floats, delta: Floats, at: dict[str, Floats]) -> tuple[_There, Floats]:
+def _delayed(there: There, bias: Floats, delta: Floats, at: dict[str, Floats]) -> tuple[There, Floats]:
     """The state `delta` (m,) s later, and its derivative (m, 9, 1) by it."""
     m, d = len(delta), delta[:, None]
     rate, force = at["gyro"] - bias[:, 3:], at["accel"] - bias[:, :3]
@@ -288,4 +289,4 @@ def _delayed(there: _There, bias: Floats, delta: Floats, at: dict[str, Floats]) 
     by_bias[:, 6:9, :3] -= d[:, :, None] * there.R
     p, v = there.p + there.v * d + 0.5 * a * d**2, there.v + a * d
     by_clock = np.concatenate([rate, v, a], axis=1)[:, :, None]
-    return _There(there.R @ turn, p, v, (by_pose, by_velocity, by_bias)), by_clock
+    return There(there.R @ turn, p, v, (by_pose, by_velocity, by_bias)), by_clock
