@@ -175,7 +175,8 @@ class RowModel(Protocol):
 
 @dataclass(frozen=True)
 class Block:
-    """m rows of one `RowModel` at one time: keys (m, k), data (m, q). One pass in batch, CustomFactors in replay.
+    """m rows of one `RowModel` at one time: keys (m, k), data (m, q). One pass in batch and in a
+    fixed lag, CustomFactors in iSAM2.
 
     rows : row of the stream behind each, -1 where there is none; used : False keeps a row out of the solve, its
     residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row divided by `reach`

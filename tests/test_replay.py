@@ -169,7 +169,7 @@ def test_gross_outliers_do_not_turn_a_replay_over():
     assert np.linalg.norm(off[31:, :2], axis=1).max() < 5.0  # m
 
 
-@pytest.mark.parametrize("scenario", ["walk-all-2min", "car-all-2min"])
+@pytest.mark.parametrize("scenario", ["walk-all-2min", pytest.param("car-all-2min", marks=pytest.mark.slow)])
 def test_no_sensor_looks_further_ahead_than_a_second(scenario):
     """All streams cut off at 36 s and at 45 s: up to a second before the first cut every state is the same bits."""
     session, config = sn.simulate(scenario), configured("fixed-lag", polish=False)

@@ -49,6 +49,8 @@ class BatchConfig:
 
 # Growing stretches shorter than this hold the first attitude.
 HOLD_S = 10.0
+# How far (m) the first guess of a place may be off, beside which fixes of metres count alone.
+PLACE_M = 1e3
 # A stretch that costs more than this a keyframe fits badly, and is solved again in parts that double from so many.
 BAD_COST = 2.5
 # A stretch that costs less than this a keyframe is a good enough guess as it is.
@@ -161,7 +163,9 @@ class Batch:
         graph = WholeGraph.of(stretch if first else stretch[1:])
         if not first:
             graph.native.push_back(self._anchor)
-        elif since < HOLD_S:
+            return graph
+        graph.native.push_back(_place(self.steps[0]))
+        if since < HOLD_S:
             graph.native.push_back(_hold(self.steps[0]))
         return graph
 
@@ -254,6 +258,13 @@ def _hold(step: Step) -> Any:
     """Keeps the attitude of the first keyframe near its guess: seconds of noisy fixes say nothing of it."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, 0.2)
     return gtsam.PoseRotationPrior3D(key("X", step.index), step.predicted.attitude(), model)
+
+
+def _place(step: Step) -> Any:
+    """Keeps the first keyframe within kilometres of its guess: before the first fix nothing else says where it is, and
+    a solve would leave it a million of them away."""
+    model = gtsam.noiseModel.Isotropic.Sigma(3, PLACE_M)
+    return gtsam.GPSFactor(key("X", step.index), step.predicted.position(), model)
 
 
 def _shot(steps: Sequence[Step], values: Any) -> Any:

@@ -153,6 +153,10 @@ def session_prior(state: SessionState) -> Any:
     return gtsam.PriorFactorVector(state.key, state.initial, gtsam.noiseModel.Diagonal.Sigmas(state.sigma))
 
 
+# Components of a row of each model.
+_SIZES: dict[RowModel, int] = {}
+
+
 def custom_factor(block: Block, row: int, held: Held) -> Any:
     """One row of a block as a gtsam.CustomFactor on the states that are not held."""
     model, keys, data = block.model, block.keys[row], block.data[row : row + 1]
@@ -169,8 +173,9 @@ def custom_factor(block: Block, row: int, held: Held) -> Any:
                 jacobians[slot] = np.asfortranarray(found[i][0])
         return np.asarray(residual[0])
 
-    dim = len(model.linearize([_zero(letter) for letter in model.letters], data)[0][0])
-    return gtsam.CustomFactor(_noise(dim, block.loss, block.reach), [keys[i] for i in free], error)
+    if model not in _SIZES:
+        _SIZES[model] = len(model.linearize([_zero(letter) for letter in model.letters], data)[0][0])
+    return gtsam.CustomFactor(_noise(_SIZES[model], block.loss, block.reach), [keys[i] for i in free], error)
 
 
 def _noise(dim: int, loss: str, reach: float) -> Any:
