@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph import health, late
-from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.calibration.apply import corrected
+from smartnav_graph.calibration.model import Calibration, ImuErrors
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors import ABSOLUTE, BUILDERS
@@ -98,13 +99,15 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     checked = health.inspect(session, gaps)
     checked.raise_errors()
     warnings = checked.warnings()
+    calibration = session.calibration or Calibration()
+    session = _calibrated(session)
+    imu = session.require_imu()
     session = _choose_sensors(session, config.run.sensors)
     session, withheld = split(at_their_time(session, config.pose_fixes), config.run.withhold)
     session, dropped = _inside_span(session, asked)
     aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
     span, told = _trimmed(asked, aiding, config.keyframes.lead_s, session.t0_ns)
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
-    calibration = session.calibration or Calibration()
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still)
@@ -118,6 +121,15 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     notes = [note for b in builders if (note := getattr(b, "note", ""))]
     warnings = [*warnings, *told, *notes, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
     return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests)
+
+
+def _calibrated(session: Session) -> Session:
+    """Inertial readings without the errors that the calibration knows, which it then no longer names."""
+    known = session.calibration
+    if known is None or known.imu_errors == ImuErrors():
+        return session
+    imu = corrected(session.require_imu(), known.imu_errors)
+    return session.replace(imu=imu, calibration=replace(known, imu_errors=ImuErrors()))
 
 
 def cut(

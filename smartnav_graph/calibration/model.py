@@ -144,6 +144,36 @@ class MagnetometerNoise:
             raise CalibrationError("calibration.toml", f"{self}", expected, "give uT and s")
 
 
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+# Largest departure of a matrix from the identity: more is a matter of axes or units, not of calibration.
+LARGEST_ERROR = 0.3
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """Deterministic errors of the inertial sensors: true = matrix (reading - bias).
+
+    accel_matrix, gyro_matrix : row-major (3, 3), scale factors and misalignments; accel_bias m/s^2, gyro_bias rad/s :
+    about which the bias states of a session stand
+    """
+
+    accel_matrix: tuple[float, ...] = _IDENTITY
+    gyro_matrix: tuple[float, ...] = _IDENTITY
+    accel_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("accel_matrix", "gyro_matrix"):
+            matrix = getattr(self, name)
+            if len(matrix) != 9 or not all(abs(a - b) <= LARGEST_ERROR for a, b in zip(matrix, _IDENTITY, strict=True)):
+                expected = f"nine numbers within {LARGEST_ERROR} of the identity, row by row"
+                raise CalibrationError(
+                    "calibration.toml", f"{name} = {list(matrix)}", expected, "turn axes in a reader"
+                )
+        if not all(map(math.isfinite, (*self.accel_bias, *self.gyro_bias))):
+            raise CalibrationError("calibration.toml", f"{self}", "finite biases", "give m/s^2 and rad/s")
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Device calibration as it stands in calibration.toml."""
@@ -156,6 +186,7 @@ class Calibration:
     barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
     step_noise: StepNoise = field(default_factory=StepNoise)
     magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
+    imu_errors: ImuErrors = field(default_factory=ImuErrors)
 
     def __post_init__(self) -> None:
         for room in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
