@@ -21,7 +21,7 @@ Source: Skog, Handel, Nilsson, Rantakokko (2010), Zero-velocity detection, IEEE 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -55,6 +55,9 @@ REST_SPEED = 0.01  # m/s
 # Turn of a device at rest between two keyframes, rad: at least, and as the time over which its scatter acts.
 LEAST_TURN, TURN_TIME = 2e-4, 0.1
 
+# Who stands with a device in the hand: scatter of block means, speed (m/s) of the hand. Walking shakes by twice that.
+STAND_IN_HAND, HAND_SPEED = (0.12, 0.15), 0.1
+
 # --- stance ---
 FORCE_UNIT, RATE_UNIT = 0.01, float(np.radians(0.1))  # sa m/s^2, sw rad/s
 STANCE_S = 0.025
@@ -72,6 +75,7 @@ class StandstillConfig:
     """Zero velocity at standstills, and no turn where the device is truly at rest.
 
     listed : use the periods of static.parquet; detect : find standstills in the inertial data
+    standing : a walker who stands with the device in the hand has no velocity, within the hand's; never on wheels
     detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (by the data)
     zupt, zaru : zero velocity, zero turn; flat_floor : all stances are on one level, to floor_sigma m
     stance_s, swing_s : longest windows of a foot-mounted IMU in and between stances
@@ -79,6 +83,7 @@ class StandstillConfig:
 
     listed: bool = True
     detect: bool = True
+    standing: bool = True
     detector: str = "shoe"
     mounting: str = "auto"
     zupt: bool = True
@@ -183,6 +188,8 @@ def find_standstills(
         blocks = _Blocks.cut(imu, gaps, gravity)
         on_foot = config.mounting == "foot" or (config.mounting == "auto" and _walks(blocks, vehicle))
         found = _rests(blocks, imu.t_ns, noise, gravity, on_foot)
+        if config.standing and vehicle == "foot" and not on_foot:
+            found = replace(found, speed_sigma=np.fmin(found.speed_sigma, _standing(blocks)))
         if on_foot:
             speed = stance_speed(imu, gravity, config.detector)
             speed = np.where(np.isnan(speed), found.speed_sigma, speed)
@@ -281,7 +288,7 @@ def _rests(blocks: _Blocks, t_ns: Times, noise: ImuNoise, gravity: float, on_foo
     if len(blocks.whole) < width:
         return Standstills.none(t_ns)
     rate, force = (sliding_window_view(x, width, axis=0) for x in (blocks.gyro, blocks.accel))
-    turning, shaking = rate.std(axis=-1).max(axis=1), force.std(axis=-1).max(axis=1)
+    turning, shaking = _scatter(rate), _scatter(force)
     per_block = NOISE_FACTOR / np.sqrt(BLOCK_S)
     slow = max(FOOT_RATE if on_foot else REST_RATE, per_block * noise.gyro_noise_density)
     soft = max(REST_FORCE, per_block * noise.accel_noise_density)
@@ -292,6 +299,22 @@ def _rests(blocks: _Blocks, t_ns: Times, noise: ImuNoise, gravity: float, on_foo
     scatter = _spread(np.where(quiet, turning, np.inf), width, margin)
     turn = np.where(np.isfinite(scatter), np.maximum(LEAST_TURN, TURN_TIME * scatter), np.nan)[blocks.of]
     return Standstills(t_ns, np.where(np.isnan(turn), np.nan, REST_SPEED), turn, on_foot)
+
+
+def _scatter(windows: Floats) -> Floats:
+    """Largest standard deviation (k,) over the axes of windows (k, 3, width)."""
+    return np.asarray(windows.std(axis=-1).max(axis=1))
+
+
+def _standing(blocks: _Blocks) -> Floats:
+    """Sigma (n,) m/s of the hand of somebody who stands; NaN where nobody does."""
+    if len(blocks.whole) < REST_BLOCKS:
+        return np.full(len(blocks.of), np.nan)
+    turning, shaking = (_scatter(sliding_window_view(x, REST_BLOCKS, axis=0)) for x in (blocks.gyro, blocks.accel))
+    whole = sliding_window_view(blocks.whole, REST_BLOCKS).all(axis=1)
+    quiet = whole & (turning < STAND_IN_HAND[0]) & (shaking < STAND_IN_HAND[1])
+    found = _spread(np.where(quiet, turning, np.inf), REST_BLOCKS, REST_MARGIN)
+    return np.where(np.isfinite(found), HAND_SPEED, np.nan)[blocks.of]
 
 
 def _spread(scatter: Floats, width: int, margin: int) -> Floats:

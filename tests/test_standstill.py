@@ -13,6 +13,7 @@ from smartnav_graph.simulation.scenarios import simulate
 from smartnav_graph.simulation.sensors import PROFILES, imu
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 from smartnav_graph.standstill import (
+    HAND_SPEED,
     LOOKAHEAD_S,
     REST_SPEED,
     StandstillConfig,
@@ -173,9 +174,33 @@ def test_real_feet_and_hands_are_told_apart(dataset):
     assert not any(on_foot(dataset("phone_mocap_tyrex") / phone) for phone in phones)
 
 
-@pytest.mark.parametrize("made", ["wheels", "foot"])
+def in_the_hand(seconds=20.0, hertz=100.0):
+    """Somebody stands: the hand trembles at one hertz by half a centimetre and three degrees."""
+    t = np.arange(0.0, seconds, 1.0 / hertz)
+    wave = np.stack([np.sin(2 * np.pi * t + phase) for phase in (0.0, 1.0, 2.0)], axis=1)
+    rate, force = 0.1 * wave, 0.15 * wave + [0.0, 0.0, GRAVITY]
+    return Imu(t_ns=np.rint(t * NS).astype(np.int64), gyro=rate, accel=force)
+
+
+def test_who_stands_with_a_device_in_the_hand_has_no_speed_but_turns():
+    samples = in_the_hand()
+    rests = found(samples, "foot")
+    assert seconds(rests.spans()) == [(0.0, 19.99)] and not rests.rests()
+    assert set(rests.speed_sigma) == {HAND_SPEED}
+    assert not found(samples, "foot", standing=False).still.any()
+    for vehicle in ("none", "car", "trolley"):  # a smooth ride trembles no more
+        assert not found(samples, vehicle).still.any()
+    walking = replace(samples, gyro=3.0 * samples.gyro, accel=samples.accel + 3.0 * (samples.accel - [0, 0, GRAVITY]))
+    assert not found(walking, "foot").still.any()
+
+
+@pytest.mark.parametrize("made", ["wheels", "foot", "hand"])
 def test_nothing_rests_on_what_comes_later_than_the_lookahead(made):
     samples, vehicle = (ride(stop_and_go()), "car") if made == "wheels" else (foot()[0], "foot")
+    if made == "hand":
+        samples = in_the_hand(40.0)
+        moving = (samples.t_ns // (5 * NS)) % 2 == 1  # stands and walks in turn
+        samples = replace(samples, gyro=samples.gyro * np.where(moving, 5.0, 1.0)[:, None])
     options = {"mounting": "foot"} if made == "foot" else {}
     whole = found(samples, vehicle, **options)
     for cut_s in (4.6, 8.3, 26.4, 30.9):

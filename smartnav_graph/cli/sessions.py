@@ -28,7 +28,7 @@ class Formats(Command):
         from smartnav_graph.readers import READERS
 
         for reader in READERS.values():
-            print(f"{reader.name:<14}{reader.summary}\n{'':<14}recognised by {reader.recognised_by}")
+            print(f"{reader.name:<18}{reader.summary}\n{'':<18}recognised by {reader.recognised_by}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,8 +30,8 @@ from smartnav_graph.standstill import StandstillConfig, Standstills
 Floats = NDArray[np.float64]
 
 TAIL = 4.0
-# In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second.
-LETS_GO = 30.0
+# In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second; in metres a second.
+LETS_GO, LETS_GO_SPEED = 30.0, 0.3
 # The pair of attitudes leaves the positions alone: m.
 ANYWHERE = 1e4
 # Prior sigma (m) of the floor's height.
@@ -85,18 +85,20 @@ class StandstillBuilder:
                 self._add_turn(step, turn)
 
     def _add_speed(self, step: Step, sigma: float) -> None:
-        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma)))
+        zero = gtsam.PriorFactorVector(
+            key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma), max(LETS_GO_SPEED / sigma, TAIL))
+        )
         step.add(Tag(self.name, step.t_ns), zero)
 
     def _add_turn(self, step: Step, sigma: float) -> None:
         before, here = key("X", step.index - 1), key("X", step.index)
-        model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3))
+        model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3), LETS_GO)
         step.add(Tag("static_turn", step.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
 
-    def _noise(self, sigmas: Floats) -> gtsam.noiseModel.Base:
+    def _noise(self, sigmas: Floats, lets_go: float) -> gtsam.noiseModel.Base:
         """Diagonal noise under the loss of a rest or of a stance."""
         losses = gtsam.noiseModel.mEstimator
-        loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(LETS_GO)
+        loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(lets_go)
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     def _add_level(self, step: Step) -> None:

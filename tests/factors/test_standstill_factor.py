@@ -94,8 +94,8 @@ def test_a_false_rest_lets_go():
     (_, factor), *_ = step_of(StandstillBuilder(rests()), 1.0, 2.0).factors
     cost = factor.error(values(speed=(20.0, 0.0, 0.0)))
     assert factor.error(values(speed=(22.0, 0.0, 0.0))) - cost < 1.0  # hardly a force at 20 m/s
-    near = factor.error(values(speed=(0.1, 0.0, 0.0)))
-    assert near == pytest.approx(0.5 * (0.1 / 0.02) ** 2, rel=0.05)  # and all of it at 0.1 m/s
+    near = factor.error(values(speed=(0.05, 0.0, 0.0)))
+    assert near == pytest.approx(0.5 * (0.05 / 0.02) ** 2, rel=0.05)  # and all of it at 0.05 m/s
 
 
 def test_a_false_stance_pulls_with_constant_force_only():
