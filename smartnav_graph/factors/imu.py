@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import gtsam
@@ -45,16 +45,20 @@ CALIBRATED_WEIGHT = 100.0
 class ImuConfig:
     """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging;
     estimate_noise : find noise densities and bias walks from the kept data (batch); scale_sigma : prior of every
-    element of scale and misalignment as a state (0.01 is usual of phones; zero: calibrated, or none)."""
+    element of scale and misalignment as a state (0.01 is usual of phones; zero: calibrated, or none); turn_share : of a
+    window's turn that both may be off by in a replay, which neither has that state nor finds its noise."""
 
     integration_sigma: float = 1e-3
     gap_factor: float = 1.0
     estimate_noise: bool = True
     scale_sigma: float = 0.0
+    turn_share: float = 0.005
 
     def __post_init__(self) -> None:
         if not (self.integration_sigma > 0 and self.gap_factor > 0):
             raise ConfigError("config [imu]", "integration_sigma or gap_factor <= 0", "> 0")
+        if self.turn_share < 0:
+            raise ConfigError("config [imu]", f"turn_share = {self.turn_share}", ">= 0")
         if not 0 <= self.scale_sigma < 0.2:
             raise ConfigError("config [imu]", f"scale_sigma = {self.scale_sigma}", "between 0 and 0.2")
 
@@ -138,6 +142,19 @@ class ImuBuilder:
         start = next(gap.start_ns for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
         return self.bridges[start]
 
+    def turning(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Memory:
+        """The memory with the gyro's noise of this window raised by what its turn may be off by.
+
+        sigma^2 T = (density^2 T) + (share |turn|)^2, for a device of which no more than its class is known, in replay.
+        """
+        known = self.weight != CLASS_WEIGHT or self.config.scale_sigma > 0
+        if memory.phase != "causal" or known or window.kind == "gap" or not self.config.turn_share:
+            return memory
+        turn = float(np.linalg.norm(window.dt @ (window.gyro - bias.gyroscope())))
+        own = self.noise.gyro_noise_density * np.sqrt(window.length_s)
+        scale = float(np.hypot(memory.scale("gyro"), self.config.turn_share * turn / own))
+        return replace(memory, noise_scales={**memory.noise_scales, "gyro": scale})
+
     def walk_sigma(self, memory: Memory) -> Floats:
         """Random walk (6,) of the biases over one second, accelerometer then gyroscope."""
         accel = self.noise.accel_bias_walk * memory.scale("accel_walk")
@@ -212,6 +229,7 @@ class ImuBuilder:
         if previous is None:
             return
         i, j = window.index - 1, window.index
+        memory = self.turning(window, previous.bias, memory)
         pim = self.preintegrate(window, previous.bias, memory)
         step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias

@@ -228,3 +228,22 @@ def test_a_window_in_a_gap_takes_the_bridge_noise():
 def test_config_refuses_what_is_not_positive(wrong):
     with pytest.raises(ConfigError, match=r"config \[imu\]: integration_sigma or gap_factor <= 0; expected > 0"):
         ImuConfig(**wrong)
+
+
+def test_a_turn_raises_the_noise_of_an_uncalibrated_gyro_in_replay():
+    dt = np.full(50, 0.01)
+    gyro = np.tile([0.0, 0.0, 0.8], (50, 1))  # 0.4 rad, its bias off 0.3 rad
+    window = Window(1, 0, NS // 2, "normal", dt, np.zeros((50, 3)), gyro)
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.2]))
+    builder = ImuBuilder(DEVICE_CLASSES["mems"], 9.81)
+    causal = Memory(phase="causal")
+    found = builder.turning(window, bias, causal).scale("gyro") * DEVICE_CLASSES["mems"].gyro_noise_density
+    own = DEVICE_CLASSES["mems"].gyro_noise_density
+    assert found**2 * 0.5 == pytest.approx(own**2 * 0.5 + (0.005 * 0.3) ** 2)
+    assert builder.turning(window, bias, Memory()).scale("gyro") == 1.0  # batch finds its noise
+    calibrated = ImuBuilder(DEVICE_CLASSES["mems"], 9.81, weight=20.0)
+    assert calibrated.turning(window, bias, causal).scale("gyro") == 1.0
+    back = Window(
+        1, 0, NS // 2, "normal", dt, np.zeros((50, 3)), np.concatenate([gyro[:25], [0.0, 0.0, 0.4] - gyro[25:]])
+    )
+    assert builder.turning(back, bias, causal).scale("gyro") == pytest.approx(1.0)  # there and back again
