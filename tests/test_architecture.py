@@ -10,7 +10,8 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 
 # From the ground up. A room is a module or a folder of modules.
 ORDER = (
-    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session", "health", "steps", "standstill"),
+    *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session"),
+    *("health", "steps", "standstill"),
     *("readers", "simulation", "vision"),
     *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "initialise", "config"),
