@@ -146,6 +146,7 @@ def summarise(
             {"start_s": round((gap.start_ns - t0) / 1e9, 3), "length_s": round(gap.length_s, 3), "kind": gap.kind}
             for gap in problem.gaps
         ],
+        "standstills": _standstills(problem),
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used_counts(problem, memory)),
         "rejected": {name: len(rows) for name, rows in memory.rejected.items()},
@@ -217,6 +218,21 @@ def _row_noise(problem: Problem, memory: Memory) -> dict[str, dict[str, Any]]:
         }
         for group, sigma in groups
     }
+
+
+def _standstills(problem: Problem) -> dict[str, Any]:
+    """How often and how long the device stood still in the stretch that was solved; how much of it truly at rest."""
+    rests = problem.rests
+    if rests is None:
+        return {}
+    first, last = problem.windows[0].t1_ns, problem.windows[-1].t1_ns
+    found = {"total_s": rests.spans(), "at_rest_s": rests.rests()}
+    inside = {
+        name: [(max(a, first), min(b, last)) for a, b in spans if b > first and a < last]
+        for name, spans in found.items()
+    }
+    seconds = {name: round(sum(b - a for a, b in spans) / 1e9, 3) for name, spans in inside.items()}
+    return {"count": len(inside["total_s"]), **seconds, "on_foot": rests.on_foot}
 
 
 def _sigma_summary(solution: Solution) -> dict[str, float]:

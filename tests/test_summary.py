@@ -90,6 +90,13 @@ def test_control_points_count_as_absolute(eight):
     assert set(summary["chi2_per_dof"]) >= {"overall"}
 
 
+def test_standstills_are_told(summary):
+    """A rest of five seconds at the start, and the slow beginning of the motion."""
+    found = summary["standstills"]
+    assert found["count"] == 1 and not found["on_foot"]
+    assert 5.0 <= found["at_rest_s"] <= found["total_s"] <= 6.0
+
+
 def test_initialisation_is_told(summary):
     start = summary["initialisation"]
     assert start["method"] == "static" and "rest of" in start["sentence"]
