@@ -19,7 +19,6 @@ from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.scenarios import Scenario
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
-from smartnav_graph.simulation.trajectory import Trajectory
 
 PARTS = {
     "rotation": slice(0, 3),
@@ -72,7 +71,7 @@ def outside(averages: dict[tuple[str, float], float], seeds: int = 30) -> dict[t
     return bad
 
 
-# --- every sensor alone, with what it minimally needs -----------------------------------------------------------------
+# --- every sensor alone, with what it minimally needs (vehicles on wheels: test_nees_car) -----------------------------
 
 SPARSE = GnssModel(rate_hz=0.1, white_m=1.0)
 
@@ -80,17 +79,6 @@ SPARSE = GnssModel(rate_hz=0.1, white_m=1.0)
 def in_hand(**sensors: Any) -> Scenario:
     """A phone carried round a figure eight that is under way too soon to have a rest."""
     return Scenario("test", 60.0, lambda s, rng: motions.figure_eight(s, rest=0.3), profile="galaxy-s2", **sensors)
-
-
-def in_car(**sensors: Any) -> Scenario:
-    """A phone in a holder of a car that is already driving, sliding and bouncing by 0.15 m/s."""
-
-    def drive(seconds: float, rng: np.random.Generator) -> Trajectory:
-        car = motions.car(seconds, rng, start_speed=12.0)
-        held = {"held_deg": (3.0, 2.0, 0.0), "carried": (0.0, 1.2, 0.5)}
-        return replace(car, sway=motions.slip(rng, 0.15), sway_speed=12.0, **held)
-
-    return Scenario("test", 120.0, drive, "car", **sensors)
 
 
 def on_foot(**sensors: Any) -> Scenario:
@@ -114,8 +102,6 @@ ALONE: dict[str, Callable[[int], Session]] = {
     "gnss velocity": in_hand(gnss=GnssModel(white_m=3.0, velocity_m_s=0.1)),
     "gnss clock": in_hand(gnss=GnssModel(white_m=0.3, offset_s=0.1)),
     "gnss wander": in_hand(gnss=GnssModel(white_m=1.0, markov_m=3.0, markov_s=30.0)),
-    "vehicle": in_car(gnss=SPARSE),
-    "wheel": in_car(gnss=SPARSE, wheel=SpeedModel(sigma_m_s=0.1)),
     "steps": on_foot(gnss=SPARSE),
     "all in a car": partial(sn.simulate, "car-all-2min"),
     "all on foot": partial(sn.simulate, "walk-all-2min"),
@@ -163,7 +149,7 @@ def test_ten_recordings_with_a_magnetometer():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensor", ["pose fixes", "magnetometer", "velocity", "gnss velocity", "wheel", "all on foot"])
+@pytest.mark.parametrize("sensor", ["pose fixes", "magnetometer", "velocity", "gnss velocity", "all on foot"])
 def test_a_sensor_that_claims_half_its_sigma_is_caught(sensor):
     assert too_sure(outside(average_nees(lambda seed: bold(ALONE[sensor](seed)), 15), 15))
 
