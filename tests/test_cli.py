@@ -218,7 +218,7 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
         ("smooth eight --out new --from 30 --to 20", "--from, --to: 30.0 s to 20.0 s; expected --from before --to"),
         ("smooth eight --out new --rate fast", "--rate: 'fast'; expected keyframes, imu or a frequency"),
         ("smooth eight --out new --initial 1,2", "--initial"),
-        ("smooth eight --out new --gnss.loss hard", "config [gnss]: loss = 'hard'; expected gate, huber or none"),
+        ("smooth eight --out new --gnss.loss hard", "config [gnss]: loss = 'hard'; expected gate, gnc, huber or none"),
         ("smooth eight --out new --sensors -gnss", "initialisation: no absolute sensor"),
         ("smooth eight --out new --sensors=-gnss", "initialisation: no absolute sensor"),
         ("smooth eight --out new --config nowhere.toml", "nowhere.toml: cannot be read"),

@@ -43,7 +43,7 @@ def test_every_section_is_a_frozen_room():
         ({"gnss": {"los": "huber"}}, ("my.toml: ", "los", "gnss", "the sections and keys of the configuration")),
         ({"gnns": {"loss": "huber"}}, ("my.toml: ", "gnns")),
         ({"keyframes": {"max_spacing_s": "fast"}}, ("my.toml: ", "keyframes.max_spacing_s")),
-        ({"gnss": {"loss": "tukey"}}, ("config [gnss]: loss = 'tukey'; expected gate, huber or none",)),
+        ({"gnss": {"loss": "tukey"}}, ("config [gnss]: loss = 'tukey'; expected gate, gnc, huber or none",)),
         ({"gnss": {"gate_probability": 1.5}}, ("gate_probability = 1.5; expected between 0.5 and 1",)),
         ({"imu": {"integration_sigma": 0.0}}, ("config [imu]",)),
         ({"control": {"default_sigma": -1.0}}, ("config [control]: default_sigma = -1.0",)),
