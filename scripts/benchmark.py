@@ -2,9 +2,10 @@
 
     scripts/benchmark [--only NAME] [--repeat 5] [--json FILE]
 
-batch-37min       simulated drive of 37 min in memory -> solution with 15x15 covariances, noise self-calibration off;
-                  baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
-batch-37min-full  the same with everything on: no calibration, fixes without sigmas, wandering errors; baseline as above
+batch-37min       simulated drive of 37 min in memory -> solution with 15x15 covariances, self-calibration off (noise,
+                  clock offset) and no vehicle constraint; baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
+batch-37min-full  the same with everything on: no calibration, fixes without sigmas, wandering errors, noise found,
+                  clock offset, vehicle constraint; baseline as above
 batch-2h          two hours, as batch-37min; baseline: batch-37min
 replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive that comes with gtsam, lag 10 s;
                   baseline: scripts/bare_fixed_lag.py
