@@ -174,7 +174,7 @@ def test_a_gap_that_nobody_saw_would_be_worse(eight):
     run, seen = sn.run(holed, blind), sn.run(holed)
     assert run.summary["gaps"] == []
     row = int(np.searchsorted(run.solution.seconds, 32.0))
-    assert run.solution.sigmas[row, 6:9].max() < 0.5 * seen.solution.sigmas[:, 6:9].max()
+    assert run.solution.sigmas[row, 6:9].max() < 0.7 * seen.solution.sigmas[:, 6:9].max()
 
 
 def test_repaired_faults_cost_little(eight, clean, tmp_path):

@@ -7,8 +7,8 @@ what stands before and after it,
 
 axis by axis, with the weights that serve best on the honest stretches of the same recording, each of which is bridged
 as if it were a gap (ridge regression towards the mean of all looks or the straight line between the borders). What is
-left where the weights were not learnt, part by part of the recording, is the noise of the bridge. Vibration asks for
-long means, a turn for a slope: the recording knows.
+left where the weights were not learnt, part by part of the recording and on stretches that look alike, is the noise of
+the bridge. Vibration asks for long means, a turn for a slope: the recording knows.
 
 Source: Priestley (1981), Spectral Analysis and Time Series, 10.3, on linear interpolation; Hastie, Tibshirani, Friedman
 (2009), The Elements of Statistical Learning, 3.4 and 7.10, on ridge regression and cross-validation.
@@ -34,6 +34,8 @@ MOMENTS = ((0.0, 0.1), (0.1, 0.3), (0.3, 0.6))
 LEAST, MOST = 30, 2000
 # How many stretches weigh as much as what weights are drawn to: the best is taken.
 RIDGES = (1e-2, 1.0, 1e6)
+# Share of the stretches, those most alike, that tell the noise of a gap.
+ALIKE = 0.1
 # Parts of the recording, each of which is bridged by what the others teach.
 FOLDS = 6
 # A bridge is never surer than so many times honest data; so many times where there is nothing to learn from.
@@ -108,17 +110,27 @@ def _seen(recorded: Recorded, start: Floats, end: Floats, looks: Sequence[Look])
 @dataclass(frozen=True)
 class Learnt:
     """How mean and slant over a gap follow from the looks: level (6,) that all counts from, weights (2, 6, k) by axis;
-    density (6,) of noise that covers what was left where they were not learnt."""
+    square (3, m, 6) of the density of noise that covers what was left of each stretch where they were not learnt, seen
+    (m, 6, k) : what the looks showed there."""
 
     level: Floats
     weights: Floats
-    density: Floats
+    square: Floats
+    seen: Floats
 
     def told(self, seen: Floats) -> Floats:
         """Mean and slant (2, 6) by what the looks (6, k) show."""
         found = np.einsum("jak,ak->ja", self.weights, seen - self.level[:, None])
         found[0] += self.level
         return np.asarray(found)
+
+    def density(self, seen: Floats) -> Floats:
+        """Noise density (6,) by the stretches that looked most alike: a turn is harder to carry on than a straight."""
+        apart = np.linalg.norm(self.seen - seen, axis=2)
+        count = max(LEAST, round(ALIKE * len(apart)))
+        alike = np.argsort(apart, axis=0, kind="stable")[:count]
+        kinds = np.take_along_axis(self.square, alike[None], axis=1).mean(axis=1)
+        return np.asarray(np.sqrt(kinds.max(axis=0)))
 
 
 def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt | None:
@@ -138,19 +150,18 @@ def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt |
         for truth, targets in ((mean - level, _flat(looks)), (slant, _slanting(looks)))
     ]
     weights, error = (np.array([[pair[i] for pair in axes] for axes in best]) for i in range(2))
-    return Learnt(level, weights, _density(recorded, start, end, error.transpose(0, 2, 1)))
+    return Learnt(level, weights, _squares(recorded, start, end, error.transpose(0, 2, 1)), seen)
 
 
-def _density(recorded: Recorded, start: Floats, end: Floats, error: Floats) -> Floats:
-    """Density (6,) of white noise that covers the errors (2, m, 6) of mean and slant: of the integral over the gap, of
-    the double integral, and of the integral over the gap's first half."""
+def _squares(recorded: Recorded, start: Floats, end: Floats, error: Floats) -> Floats:
+    """Squares (3, m, 6) of the white noise density that the errors (2, m, 6) of mean and slant speak for, and the error
+    of the integral over the first half of a gap of length T: D^2 / T, D^2 / 3 T and D^2 T / 2 are their variances."""
     mean, slant = recorded.mean(start, end) - error[0], recorded.slant(start, end) - error[1]
     first, last = recorded.at(recorded.signal, start), recorded.at(recorded.signal, end)
     half = 0.5 * mean - (last - first) / 8.0 - 30.0 / 32.0 * (slant - (last - first) / 6.0)
     missed = 0.5 * recorded.mean(start, 0.5 * (start + end)) - half
-    by_mean, by_slant, by_half = ((e**2).mean(axis=0) for e in (*error, missed))
-    worst = np.max([by_mean, 0.75 * (by_mean + by_slant), 2.0 * by_half], axis=0)
-    return np.asarray(np.sqrt(worst * float(np.mean(end - start))))
+    factors = np.array([1.0, 3.0, 2.0])[:, None, None] * (end - start)[:, None]
+    return np.asarray(factors * np.array([*error, missed]) ** 2)
 
 
 def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -225,8 +236,9 @@ def _bridge(recorded: Recorded, gap: Gap, imu: Imu, floor: ImuNoise) -> Bridge:
     while span > 2 * float(np.median(np.diff(recorded.t))):
         learnt = _learn(recorded, span, looks)
         if learnt is not None:
-            density = np.maximum(learnt.density, FLOOR * least)
-            return Bridge(density[:3], density[3:], learnt.told(_seen(recorded, start, end, looks)[0]))
+            seen = _seen(recorded, start, end, looks)[0]
+            density = np.maximum(learnt.density(seen), FLOOR * least)
+            return Bridge(density[:3], density[3:], learnt.told(seen))
         span /= 2
     return Bridge(UNKNOWN * least[:3], UNKNOWN * least[3:])
 
