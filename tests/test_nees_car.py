@@ -21,7 +21,7 @@ GNSS = GnssModel(white_m=1.0)
 
 
 def slipping_car(seconds: float, rng: np.random.Generator) -> Trajectory:
-    """On the move; a phone turned by 3 deg, ahead of the rear axle and above it; side and vertical speeds of 0.15 m/s at 15 m/s."""
+    """On the move; a phone turned by 3 deg, ahead of the rear axle and above it; slip of 0.15 m/s at 15 m/s."""
     car = motions.car(seconds, rng, start_speed=12.0)
     return replace(car, held_deg=(3.0, 2.0, 0.0), carried=(0.0, 1.2, 0.5), sway=(*car.sway, *motions.slip(rng, 0.15)))
 
