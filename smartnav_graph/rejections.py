@@ -41,7 +41,9 @@ def _positions(problem: Problem, estimate: Estimate, memory: Memory) -> list[Rej
         for k in out:
             row = int(residuals.rows[k])
             t_ns = int(estimate.t_ns[residuals.keyframe[k]] if stream is None else stream.t_ns[row])
-            told.append(_entry(problem, t_ns, builder.name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)})
+            told.append(
+                _entry(problem, t_ns, builder.name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)}
+            )
     return told
 
 
