@@ -73,7 +73,7 @@ def test_a_benchmark_measures_a_fresh_process(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout)
     assert set(told) == {"seconds", "peak_memory_mb", "detail"}
-    assert told["detail"]["keyframes"] == 61 and told["peak_memory_mb"] > 50
+    assert told["detail"]["keyframes"] == 62 and told["peak_memory_mb"] > 50
     assert told["seconds"] == pytest.approx(told["detail"]["update_ms"]["p99"] / 1e3)
 
 

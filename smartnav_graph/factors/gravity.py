@@ -34,12 +34,11 @@ Floats = NDArray[np.float64]
 
 # What holds tilt in the end: everything that knows position or velocity.
 HOLDS_TILT = ("gnss", "control", "pose_fixes", "velocity", "wheel")
-WHEELED = ("car", "trolley")
 
 
 @dataclass(frozen=True)
 class GravityConfig:
-    """enabled : ``auto`` (by hand, where no position, velocity or rest has come for `alone_s`), ``on``, ``off``;
+    """enabled : ``auto`` (on foot, where no position, velocity or rest has come for `alone_s`), ``on``, ``off``;
     stretch_s : over which the force is averaged; least_sigma m/s^2 : of a device at rest; speed m/s : of whoever moves,
     along one axis, climb m/s : upwards; share : of the scatter of the force that does not average out."""
 
@@ -170,7 +169,8 @@ REST_SCATTER = 0.1
 def build(context: FactorContext) -> GravityBuilder | None:
     """The tilt of whoever has nothing else."""
     config = context.config.gravity
-    if config.enabled == "off" or (config.enabled == "auto" and (context.vehicle in WHEELED or context.on_foot)):
+    carried = context.vehicle == "foot" and not context.on_foot  # a car nobody declared is no walker
+    if config.enabled == "off" or (config.enabled == "auto" and not carried):
         return None
     stamps = [stream.t_ns for name, stream in context.session.streams().items() if name in HOLDS_TILT]
     if context.rests is not None:  # from a rest on the gyro holds it for a while

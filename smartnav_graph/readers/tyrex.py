@@ -108,7 +108,11 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         tables["reference"] = (truth, columns | _own_attitude(folder, system, columns["t_ns"]))
         dropped |= {"reference": {"of frames without markers dropped": lost}} if lost else {}
     session = build_session(
-        tables, repairs, device=Device(name=_device(folder)), clock_epoch=system.epoch, gravity_m_s2=GRAVITY
+        tables,
+        repairs,
+        device=Device(name=_device(folder), vehicle="foot"),
+        clock_epoch=system.epoch,
+        gravity_m_s2=GRAVITY,
     )
     names = {*dropped, *session.dropped}
     return session.replace(dropped={name: {**session.dropped.get(name, {}), **dropped.get(name, {})} for name in names})

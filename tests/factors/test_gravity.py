@@ -145,20 +145,20 @@ def context(vehicle: str = "none", enabled: str = "auto", rests: Standstills | N
     return FactorContext(session, Calibration(), [], vehicle, config, rests)
 
 
-def test_wheels_hold_tilt_by_themselves():
-    assert gravity.build(context("car")) is None and gravity.build(context("trolley")) is None
+def test_only_who_is_carried_on_foot_is_a_walker():
+    assert all(gravity.build(context(vehicle)) is None for vehicle in ("none", "car", "trolley"))
     assert gravity.build(context("car", "on")) is not None
-    assert gravity.build(context("foot")) is not None and gravity.build(context(enabled="off")) is None
+    assert gravity.build(context("foot")) is not None and gravity.build(context("foot", "off")) is None
 
 
 def test_fixes_and_rests_hold_tilt():
-    assert len(gravity.build(context()).held_ns) == 0
+    assert len(gravity.build(context("foot")).held_ns) == 0
     session = record().session
-    made = gravity.build(context(gnss=session.gnss))
+    made = gravity.build(context("foot", gnss=session.gnss))
     np.testing.assert_array_equal(made.held_ns, session.gnss.t_ns)
     t = START_NS + np.arange(100) * NS // 10
     still = np.where((np.arange(100) >= 20) & (np.arange(100) < 40), 0.001, np.nan)
-    made = gravity.build(context(rests=Standstills(t, still, still)))
+    made = gravity.build(context("foot", rests=Standstills(t, still, still)))
     np.testing.assert_array_equal(made.held_ns, t[[20, 39]])
 
 
