@@ -34,7 +34,7 @@ def test_a_keyframe_at_every_fix_and_at_the_end(eight):
     assert [window.index for window in problem.windows] == list(range(62))
     assert [window.kind for window in problem.windows[:8]] == ["first", *["static"] * 6, "normal"]
     assert problem.windows[0].kind == "first" and problem.windows[0].rows["gnss"].tolist() == [0]
-    assert [builder.name for builder in problem.builders] == ["imu", "gnss", "static", "gravity"]
+    assert [builder.name for builder in problem.builders] == ["imu", "gnss", "static"]
     assert not problem.dropped and not problem.gaps and problem.vehicle == "none"
 
 
@@ -48,9 +48,7 @@ def test_sensors_are_chosen_by_name(eight):
     both = eight.replace(control=on_control(eight, slice(0, None, 10), 0.02, 0))
     for chosen, names in ((("control",), ["imu", "control", "static"]), (("-gnss",), None), ((), None)):
         builders = [builder.name for builder in prepare(both, run(sensors=chosen)).builders]
-        assert [name for name in builders if name != "gravity"] == (
-            names or ["imu", *(["gnss"] if not chosen else []), "control", "static"]
-        )
+        assert builders == (names or ["imu", *(["gnss"] if not chosen else []), "control", "static"])
 
 
 def test_an_unknown_sensor_is_refused(eight):

@@ -122,7 +122,8 @@ def afoot(seed: int | None) -> Recording:
     way = Legs([Leg(70.0, 1.35)], speed=1.35, heading_deg=30.0)
     walk = Trajectory(way, held_deg=(0.0, 35.0, 4.0), sway=motions.walk(10.0, np.random.default_rng(0)).sway)
     made = record(walk, seed=seed)
-    return replace(made, session=made.session.replace(gnss=None, control=None))
+    device = Device(name="exact", vehicle="foot")
+    return replace(made, session=made.session.replace(gnss=None, control=None, device=device))
 
 
 @cache
