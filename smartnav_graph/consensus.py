@@ -32,7 +32,7 @@ UNTOLD = 2.0
 # Noise of what nobody measured inside a gap: m/s^2 and rad/s per sqrt(Hz).
 GAP_ACCEL, GAP_GYRO = 0.25, 0.05
 KICK_S = 10.0
-PROBABILITY = 0.999
+LIMIT = float(chi2.ppf(0.999, 3))  # of the squares of fixes that agree
 GROWTH = 1.4  # of the control, a step
 STEPS = 80
 MOST_FIXES = 300
@@ -74,15 +74,11 @@ class Agreed:
     @property
     def outside(self) -> NDArray[np.bool_]:
         """Mask (m,) of the fixes that do not agree."""
-        return self.square > _limit()
+        return self.square > LIMIT
 
     @property
     def cost(self) -> float:
-        return graduated.truncated(self.square, _limit())
-
-
-def _limit() -> float:
-    return float(chi2(3).ppf(PROBABILITY))
+        return graduated.truncated(self.square, LIMIT)
 
 
 def _integrated(windows: Sequence[Window], bias: Floats) -> tuple[Floats, Floats]:
@@ -202,9 +198,9 @@ def _agree(problem: Agreement, R: Floats, p: Floats, v: Floats) -> Agreed:
     state, weight = problem.start(R, p, v), np.ones(len(problem.t))
     for _ in range(FIRST_STEPS):
         state = problem.better(state, weight)
-    mu = graduated.first_control(state.square, _limit())
+    mu = graduated.first_control(state.square, LIMIT)
     for _ in range(STEPS):
-        weight = graduated.weights(state.square, _limit(), mu)
+        weight = graduated.weights(state.square, LIMIT, mu)
         for _ in range(2):
             state = problem.better(state, weight)
         if np.isinf(mu) or (mu > 1.0 and graduated.settled(weight)):

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from smartnav_graph.assemble import Withheld, carried_over, causal_solution, densify, score, to_solution, used_counts
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
-from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.magnetometer import MagnetometerBuilder
 from smartnav_graph.factors.pose_fix import AttitudeBuilder
@@ -31,7 +30,6 @@ from smartnav_graph.first_attitude import LONGEST_S, AttitudeStart, attitude_sta
 from smartnav_graph.first_field import field_start
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.initialise import Given, Initial, Initialiser
-from smartnav_graph.late import known_ns
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.revise import extra_passes, position_builders, revise
 from smartnav_graph.session import Session
@@ -233,7 +231,7 @@ def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
     if builder is None or stream is None:
         return None
     start, sigma = problem.windows[0].t1_ns, problem.calibration.imu_noise.gyro_bias_sigma
-    rows = builder.known & ((known_ns(stream) <= start + LONGEST_S * NS) if causal else True)
+    rows = builder.known & ((stream.known_ns <= start + LONGEST_S * NS) if causal else True)
     nav_R_body = builder.attitude[rows] @ builder.mount.T
     return attitude_start(problem.session.require_imu(), start, stream.t_ns[rows], nav_R_body, sigma)
 
@@ -266,14 +264,14 @@ def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
 
 def _absolute_positions(problem: Problem) -> tuple[Times, Floats, list[tuple[str, int]], Times]:
     """Stamps, nav positions, sensor and row, and arrival of all absolute measurements, in time order."""
-    streams = {name: stream for name in ABSOLUTE if (stream := getattr(problem.session, name)) is not None}
+    streams = problem.session.absolute()
     if not streams:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), [], np.zeros(0, dtype=np.int64)
     t = np.concatenate([stream.t_ns for stream in streams.values()])
     p = np.concatenate([problem.session.nav_position(stream) for stream in streams.values()])
     sources = [(name, row) for name, stream in streams.items() for row in range(len(stream))]
     order = np.argsort(t, kind="stable")
-    known = np.concatenate([known_ns(stream) for stream in streams.values()])
+    known = np.concatenate([stream.known_ns for stream in streams.values()])
     return t[order], p[order], [sources[i] for i in order], known[order]
 
 

@@ -29,13 +29,11 @@ from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.estimate import Run
 from smartnav_graph.evaluation.metrics import Statistics
-from smartnav_graph.factors import ABSOLUTE
 from smartnav_graph.graph import Window
-from smartnav_graph.late import known_ns
 from smartnav_graph.prediction import Kinematics, foretold_at, states_at
 from smartnav_graph.problem import prepare
 from smartnav_graph.session import Session
-from smartnav_graph.streams import PoseFix, Reference
+from smartnav_graph.streams import ABSOLUTE, PoseFix, Reference
 from smartnav_graph.timebase import NS, nearest
 
 Floats = NDArray[np.float64]
@@ -163,11 +161,9 @@ def _noisy(truth: Reference, made: FixesFromReference, seed: int) -> PoseFix:
 def _thinned(session: Session, every_s: float) -> Session:
     """The session with the first row of each absolute stream in every stretch of `every_s`."""
     changes = {}
-    for name in ABSOLUTE:
-        stream = getattr(session, name)
-        if stream is not None:
-            slot = (stream.t_ns - session.t0_ns) // round(every_s * NS)
-            changes[name] = stream.take(np.unique(slot, return_index=True)[1])
+    for name, stream in session.absolute().items():
+        slot = (stream.t_ns - session.t0_ns) // round(every_s * NS)
+        changes[name] = stream.take(np.unique(slot, return_index=True)[1])
     return _checked(session.replace(**changes), every_s)
 
 
@@ -185,8 +181,8 @@ def _checked(session: Session, every_s: float) -> Session:
 
 def _fix_times(session: Session) -> Times:
     """Stamps of all fixes, each once, in order."""
-    streams = [stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *(stream.t_ns for stream in streams)]))
+    stamps = (stream.t_ns for stream in session.absolute().values())
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *stamps]))
 
 
 def _scored(
@@ -215,8 +211,7 @@ def _scored(
 
 def _arrivals(session: Session) -> Times:
     """When each fix became known."""
-    streams = [stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None]
-    return np.unique(np.concatenate([known_ns(stream) for stream in streams]))
+    return np.unique(np.concatenate([stream.known_ns for stream in session.absolute().values()]))
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,9 @@ from smartnav_graph.streams import Stream
 Times = NDArray[np.int64]
 
 
-def known_ns(stream: Stream) -> Times:
-    """When each row (n,) became known."""
-    return stream.t_ns if stream.arrival_ns is None else stream.arrival_ns
-
-
 def is_late(stream: Stream, merge_ns: int) -> NDArray[np.bool_]:
     """Mask (n,) of the rows that became known more than `merge_ns` after their time."""
-    return known_ns(stream) - stream.t_ns > merge_ns
+    return stream.known_ns - stream.t_ns > merge_ns
 
 
 def arrange(
@@ -40,7 +35,7 @@ def arrange(
     late: list[dict[str, list[LateRow]]] = [{} for _ in windows]
     lost: dict[str, int] = {}
     for name, mask in masks.items():
-        rows, stamps, known = np.flatnonzero(mask), streams[name].t_ns, known_ns(streams[name])
+        rows, stamps, known = np.flatnonzero(mask), streams[name].t_ns, streams[name].known_ns
         rows = rows[np.argsort(known[rows], kind="stable")]
         arrives = np.searchsorted(ends, known[rows])
         speaks = np.searchsorted(ends, stamps[rows], side="right")
@@ -60,5 +55,5 @@ def _arranged(window: Window, late: Mapping[str, Sequence[LateRow]], masks: Mapp
 
 def forget(windows: Sequence[Window], streams: Mapping[str, Stream], now_ns: int) -> list[Window]:
     """The windows without the rows that were not known yet at `now_ns`."""
-    masks = {name: known_ns(stream) > now_ns for name, stream in streams.items()}
+    masks = {name: stream.known_ns > now_ns for name, stream in streams.items()}
     return [_arranged(window, {}, masks) for window in windows]

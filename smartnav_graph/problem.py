@@ -13,7 +13,7 @@ from smartnav_graph.calibration.apply import corrected
 from smartnav_graph.calibration.model import Calibration, ImuErrors
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.factors import ABSOLUTE, BUILDERS
+from smartnav_graph.factors import BUILDERS
 from smartnav_graph.factors.bridging import bridged
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.pose_fix import at_their_time
@@ -105,17 +105,17 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     session = _choose_sensors(session, config.run.sensors)
     session, withheld = split(at_their_time(session, config.pose_fixes), config.run.withhold)
     session, dropped = _inside_span(session, asked)
-    aiding = {name: stream.t_ns for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
+    aiding = {name: stream.t_ns for name, stream in session.absolute().items()}
     span, told = _trimmed(asked, aiding, config.keyframes.lead_s, session.t0_ns)
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still)
-    windows, lost = cut(session, config, span, gaps, rests, causal=causal)
+    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal)
+    windows, lost = cut(context, span)
     for name, count in lost.items():
         dropped.setdefault(name, {})["arrived after the end"] = count
-    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal)
-    builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
+    builders = made_of(context)
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
     notes = [note for b in builders if (note := getattr(b, "note", ""))]
@@ -132,29 +132,27 @@ def _calibrated(session: Session) -> Session:
     return session.replace(imu=imu, calibration=replace(known, imu_errors=ImuErrors()))
 
 
-def cut(
-    session: Session,
-    config: Config,
-    span: tuple[int, int],
-    gaps: Sequence[Gap],
-    rests: Standstills,
-    *,
-    causal: bool,
-) -> tuple[list[Window], dict[str, int]]:
+def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], dict[str, int]]:
     """The windows of a stretch, and how many rows of each stream are not known by its end."""
-    spacing, still = config.keyframes, config.standstill
+    session, causal = context.session, context.causal
+    spacing, still = context.config.keyframes, context.config.standstill
+    rests = context.rests or Standstills.none(session.require_imu().t_ns)
     if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
         spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, still.swing_s))
     standing = rests.keyframes(still.stance_s if rests.on_foot else None)
     merge = round(spacing.merge_s * NS)
-    streams = {name: stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None}
+    streams = session.absolute()
     aiding = {name: stream.t_ns for name, stream in streams.items()}
-    epochs = [late.known_ns(stream) if causal else stream.t_ns for stream in streams.values()]
-    times = keyframe_times(span, epochs, gaps, spacing, standing)
-    noise = (session.calibration or Calibration()).imu_noise
-    imu = bridged(session.require_imu(), gaps, noise, causal=causal)
-    windows = make_windows(imu, times, gaps, aiding, spacing, rests.spans())
+    epochs = [stream.known_ns if causal else stream.t_ns for stream in streams.values()]
+    times = keyframe_times(span, epochs, context.gaps, spacing, standing)
+    imu = bridged(session.require_imu(), context.gaps, context.bridges)
+    windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
     return late.arrange(windows, streams, merge) if causal else (windows, {})
+
+
+def made_of(context: FactorContext) -> list[Builder]:
+    """The builders of everything that a session has."""
+    return [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
 
 
 def recut(problem: Problem, known_ns: int | None = None) -> Problem:
@@ -162,17 +160,13 @@ def recut(problem: Problem, known_ns: int | None = None) -> Problem:
     Only rows known by `known_ns` where that is given; the problem itself where there is no difference."""
     session, config, gaps = problem.session, problem.config, problem.gaps
     merge = round(config.keyframes.merge_s * NS)
-    streams = [stream for name in ABSOLUTE if (stream := getattr(session, name)) is not None]
-    if not gaps and not any(late.is_late(stream, merge).any() for stream in streams):
+    if not gaps and not any(late.is_late(stream, merge).any() for stream in session.absolute().values()):
         return problem
-    span = problem.windows[0].t1_ns, problem.windows[-1].t1_ns
-    rests = problem.rests or Standstills.none(session.require_imu().t_ns)
-    windows, _ = cut(session, config, span, gaps, rests, causal=False)
+    context = FactorContext(session, problem.calibration, gaps, problem.vehicle, config, problem.rests)
+    windows, _ = cut(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
     if known_ns is not None:
         windows = late.forget(windows, session.streams(), known_ns)
-    context = FactorContext(session, problem.calibration, gaps, problem.vehicle, config, rests)
-    builders = [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
-    return replace(problem, windows=windows, builders=builders)
+    return replace(problem, windows=windows, builders=made_of(context))
 
 
 def _choose_sensors(session: Session, chosen: Sequence[str]) -> Session:
@@ -212,10 +206,7 @@ def _inside_span(session: Session, span: tuple[int, int]) -> tuple[Session, dict
     imu = session.require_imu()
     dropped: dict[str, dict[str, int]] = {}
     changes: dict[str, Positioned | None] = {}
-    for name in ABSOLUTE:
-        stream = getattr(session, name)
-        if stream is None:
-            continue
+    for name, stream in session.absolute().items():
         outside = int(((stream.t_ns < imu.t_ns[0]) | (stream.t_ns > imu.t_ns[-1])).sum())
         if outside:
             dropped[name] = {"outside the inertial span": outside}

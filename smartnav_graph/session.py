@@ -23,6 +23,7 @@ from smartnav_graph.errors import CalibrationError, SessionError
 from smartnav_graph.files import replacing
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.streams import (
+    ABSOLUTE,
     STREAMS,
     Barometer,
     ControlPoint,
@@ -126,6 +127,10 @@ class Session:
         """The streams that are there, by name."""
         there = ((name, getattr(self, name)) for name in STREAMS)
         return {name: stream for name, stream in there if stream is not None}
+
+    def absolute(self) -> dict[str, Positioned]:
+        """The streams that tell a position by themselves, by name."""
+        return {name: stream for name in ABSOLUTE if (stream := getattr(self, name)) is not None}
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""

@@ -45,6 +45,11 @@ class Stream:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    @property
+    def known_ns(self) -> NDArray[np.int64]:
+        """When each row (n,) became known."""
+        return self.t_ns if self.arrival_ns is None else self.arrival_ns
+
     def __post_init__(self) -> None:
         for spec in self.specs():
             value = getattr(self, spec.name)
@@ -344,6 +349,9 @@ class Reference(Stream):
     gyro_bias: Array | None = _axes("gyro_bias_{}_rad_s", optional=True)
     sigma: Array | None = _axes("sigma_{}_m", "enu", optional=True, nan=True)
 
+
+# Streams that tell a position by themselves. Their rows make keyframes.
+ABSOLUTE = ("gnss", "control", "pose_fixes")
 
 STREAMS: dict[str, type[Stream]] = {
     cls.NAME: cls

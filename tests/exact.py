@@ -16,7 +16,7 @@ import numpy as np
 
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.config import Config
-from smartnav_graph.factors import ABSOLUTE, BUILDERS, FactorContext
+from smartnav_graph.factors import BUILDERS, FactorContext
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.graph import STATES, Memory, State, Tag, Window, build_step, key
 from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
@@ -136,7 +136,7 @@ def assemble(
     keyframes = keyframes or KeyframeConfig()
     imu = session.require_imu()
     span = span or (int(imu.t_ns[0]), int(imu.t_ns[-1]))
-    aiding = {name: s.t_ns for name in ABSOLUTE if (s := getattr(session, name)) is not None}
+    aiding = {name: stream.t_ns for name, stream in session.absolute().items()}
     times = keyframe_times(span, list(aiding.values()), gaps, keyframes)
     windows = make_windows(imu, times, gaps, aiding, keyframes)
     calibration, config = session.calibration or Calibration(), Config(gnss=GnssConfig(loss="none"))

@@ -38,5 +38,3 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "barometer": barometer.build,
     "steps": step.build,
 }
-# Streams that hold the trajectory by themselves. Their rows make keyframes.
-ABSOLUTE = ("gnss", "control", "pose_fixes")

@@ -16,7 +16,7 @@ Source: Priestley (1981), Spectral Analysis and Time Series, 10.3, on linear int
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -212,6 +212,8 @@ def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
 def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> dict[int, Bridge]:
     """The best bridge of every gap, by its start stamp. Where no honest stretch is as long as a gap, shorter ones stand
     in. `causal` : each is learnt from what was recorded by `REACH` after it, or in the first `START_S`."""
+    if not gaps:
+        return {}
     if not causal:
         recorded = Recorded(imu, gaps)
         return {gap.start_ns: _bridge(recorded, gap, imu, floor) for gap in gaps}
@@ -243,12 +245,12 @@ def _bridge(recorded: Recorded, gap: Gap, imu: Imu, floor: ImuNoise) -> Bridge:
     return Bridge(UNKNOWN * least[:3], UNKNOWN * least[3:])
 
 
-def bridged(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> Imu:
-    """The inertial data with a curve of the foretold mean and slant across every gap: the straight line between its
-    borders and a cubic on it. Where no samples are, the curve is sampled at the recording's own rate."""
+def bridged(imu: Imu, gaps: Sequence[Gap], found: Mapping[int, Bridge]) -> Imu:
+    """The inertial data with a curve of the mean and slant that its bridge tells across every gap: the straight line
+    between its borders and a cubic on it. Where no samples are, the curve is sampled at the recording's own rate."""
     if not gaps:
         return imu
-    found, recorded = bridges(imu, gaps, floor, causal=causal), Recorded(imu, gaps)
+    recorded = Recorded(imu, gaps)
     t_ns = np.unique(np.concatenate([imu.t_ns, *(_inner(gap, imu) for gap in gaps if gap.kind == "missing")]))
     signal = recorded.at(recorded.signal, (t_ns - int(imu.t_ns[0])) / NS)
     for gap in gaps:

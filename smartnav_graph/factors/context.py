@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.factors import bridging
+from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.session import Session
 from smartnav_graph.standstill import Standstills
 from smartnav_graph.timebase import Gap
@@ -25,6 +28,12 @@ class FactorContext:
     config: Any
     rests: Standstills | None = None
     causal: bool = False
+
+    @cached_property
+    def bridges(self) -> Mapping[int, Bridge]:
+        """The bridge of every gap, by its start stamp."""
+        noise = self.calibration.imu_noise
+        return bridging.bridges(self.session.require_imu(), self.gaps, noise, causal=self.causal)
 
     @property
     def on_foot(self) -> bool:

@@ -28,12 +28,13 @@ from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.magnetometer import turned_mean
 from smartnav_graph.factors.observation import AtKeyframe, skew, turned
 from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
+from smartnav_graph.streams import ABSOLUTE
 from smartnav_graph.timebase import NS, ns_from_seconds
 
 Floats = NDArray[np.float64]
 
 # What holds tilt in the end: everything that knows position or velocity.
-HOLDS_TILT = ("gnss", "control", "pose_fixes", "velocity", "wheel")
+HOLDS_TILT = (*ABSOLUTE, "velocity", "wheel")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegratio
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import bridging, scale
+from smartnav_graph.factors import scale
 from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import LAST_STAGE, Memory, State, Step, Tag, Window, key
@@ -109,7 +109,7 @@ class ImuBuilder:
     noise: ImuNoise
     gravity: float
     gaps: Sequence[Gap] = ()
-    bridges: dict[int, Bridge] = field(default_factory=dict)
+    bridges: Mapping[int, Bridge] = field(default_factory=dict)
     config: ImuConfig = field(default_factory=ImuConfig)
     name: str = "imu"
     stage: int = 0
@@ -261,8 +261,8 @@ class ImuBuilder:
 
 def build(context: FactorContext) -> ImuBuilder:
     """The builder of a session's inertial data."""
-    imu, noise = context.session.require_imu(), context.calibration.imu_noise
-    bridges = bridging.bridges(imu, context.gaps, noise, causal=context.causal)
+    noise = context.calibration.imu_noise
     known = noise != DEVICE_CLASSES[context.calibration.device_class]
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
-    return ImuBuilder(noise, context.session.gravity, context.gaps, bridges, context.config.imu, weight=weight)
+    gravity, options = context.session.gravity, context.config.imu
+    return ImuBuilder(noise, gravity, context.gaps, context.bridges, options, weight=weight)

@@ -34,7 +34,6 @@ from smartnav_graph.timebase import NS
 Floats = NDArray[np.float64]
 
 # Streams whose positions tell the heading of whoever moves.
-POSITIONS = {"gnss", "control", "pose_fixes"}
 # Names of the states.
 IRON, STRENGTH = "magnetometer_hard_iron_ut", "magnetometer_field_ut"
 # Horizontal and vertical strength (uT, mean and sigma) of the field anywhere on Earth, for sessions without origin.
@@ -221,7 +220,7 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
         float(np.hypot(noise.hard_iron_sigma_ut, unearthly(first_second(stream) - np.array(noise.hard_iron_ut)))),
         noise,
         config,
-        stage=LAST_STAGE if POSITIONS & set(context.session.streams()) else 0,
+        stage=LAST_STAGE if context.session.absolute() else 0,
         held_in_replay=context.config.replay.smoother == "isam2",
     )
 

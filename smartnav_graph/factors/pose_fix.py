@@ -64,9 +64,8 @@ def at_their_time(session: Session, config: PoseFixConfig) -> Session:
     fixes = session.pose_fixes
     if fixes is None or config.latency_s == 0:
         return session
-    known = fixes.t_ns if fixes.arrival_ns is None else fixes.arrival_ns
     stamps = fixes.t_ns - round(config.latency_s * NS)
-    return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=known))
+    return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=fixes.known_ns))
 
 
 def left_jacobian_inverse(theta: Floats) -> Floats:

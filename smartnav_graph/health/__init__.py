@@ -13,13 +13,13 @@ import numpy as np
 
 from smartnav_graph.errors import SessionError
 from smartnav_graph.health import inertial, positions, sensors, streams
-from smartnav_graph.health.facts import ABSOLUTE, AIDING, Facts, Finding
+from smartnav_graph.health.facts import AIDING, Facts, Finding
 from smartnav_graph.health.inertial import quiet_accel, tilt_errors
 from smartnav_graph.session import Session
-from smartnav_graph.streams import Stream
+from smartnav_graph.streams import ABSOLUTE, Stream
 from smartnav_graph.timebase import Gap, find_gaps, seconds_since
 
-__all__ = ["ABSOLUTE", "AIDING", "Finding", "Health", "StreamHealth", "inspect", "quiet_accel", "tilt_errors"]
+__all__ = ["AIDING", "Finding", "Health", "StreamHealth", "inspect", "quiet_accel", "tilt_errors"]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.session import Session
-from smartnav_graph.streams import Imu, Positioned
+from smartnav_graph.streams import ABSOLUTE, Imu, Positioned
 from smartnav_graph.timebase import NS, Gap, interpolate
 
 Floats = NDArray[np.float64]
 
-ABSOLUTE = ("gnss", "control", "pose_fixes")  # sensors that tell a position
 AIDING = (*ABSOLUTE, "static", "magnetometer", "barometer", "velocity", "wheel")
 JUDGED = 10  # rows from which on a stream is judged
 CHORD_S = 4.0  # s, over which fixes tell a speed

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.health.facts import (
-    ABSOLUTE,
     JUDGED,
     Facts,
     Finding,
@@ -87,8 +86,7 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
 
 def _geodetic(facts: Facts) -> dict[str, Floats]:
     """Latitude and longitude (deg) and height (n, 3) m of the streams that tell them."""
-    streams = {name: getattr(facts.session, name) for name in ABSOLUTE}
-    return {name: s.lla for name, s in streams.items() if s is not None and len(s) and s.lla is not None}
+    return {name: s.lla for name, s in facts.session.absolute().items() if len(s) and s.lla is not None}
 
 
 def _degrees_apart(one: Floats, other: Floats) -> float:

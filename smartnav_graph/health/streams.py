@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.health.facts import ABSOLUTE, AIDING, JUDGED, Facts, Finding, period
-from smartnav_graph.streams import StaticPeriod
+from smartnav_graph.health.facts import AIDING, JUDGED, Facts, Finding, period
+from smartnav_graph.streams import ABSOLUTE, StaticPeriod
 from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,7 @@ def _rows(facts: Facts) -> Iterator[Finding]:
         yield Finding("error", "imu", "has one row only", "import at least two")
     elif len(session.imu) and (length := (session.imu.t_ns[-1] - session.imu.t_ns[0]) / NS) < 1.0:
         yield Finding("warning", "imu", f"lasts {length:.3f} s only", "check the unit of its time stamps")
-    if not any(getattr(session, name) is not None for name in ABSOLUTE):
+    if not session.absolute():
         text = f"no absolute sensor ({', '.join(ABSOLUTE)})"
         yield Finding("warning", "session", text, "start from a standstill or with --initial for dead reckoning")
 
