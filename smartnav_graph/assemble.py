@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from smartnav_graph.errors import SessionError
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
-from smartnav_graph.graph import Memory, State, Window, key
+from smartnav_graph.graph import Memory, State, Window
+from smartnav_graph.losses import loss_weights
 from smartnav_graph.prediction import Kinematics, states_at
 from smartnav_graph.problem import TOO_LATE, Problem
 from smartnav_graph.revise import fix_residuals, position_builders
-from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.whole_graph import Stack, loss_weights
+from smartnav_graph.smoothers.estimate import Estimate, values_of
+from smartnav_graph.smoothers.whole_graph import Stack
 from smartnav_graph.solution import Residuals, Solution
 from smartnav_graph.timebase import NS, interpolate, ns_from_seconds
 
@@ -73,11 +74,7 @@ def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]
     session states as they are."""
     t_ns = np.array([window.t1_ns for window in windows], dtype=np.int64)
     there = states_at(problem.windows, Kinematics(*estimate.states()), problem.session.gravity, t_ns)
-    values = gtsam.Values()
-    for window, R, p, v, bias in zip(windows, *there, strict=True):
-        values.insert(key("X", window.index), gtsam.Pose3(gtsam.Rot3(R), p))
-        values.insert(key("V", window.index), v)
-        values.insert(key("B", window.index), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+    values = values_of([window.index for window in windows], *there)
     for state in estimate.session.values():
         values.insert(state.key, state.value)
     return values
@@ -125,9 +122,8 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
 
 def _of_stack(stack: Stack, estimate: Estimate) -> Part:
     white, _ = stack.linearize(estimate.values)
-    t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys], dtype=np.int64)
-    weight = np.where(stack.used, loss_weights((white**2).sum(axis=1), stack.loss, stack.reach)[0], 0.0)
-    return t_ns, stack.blocks[0].sensor, white, weight, stack.used
+    weight = np.where(stack.used, stack.weight(white), 0.0)
+    return stack.t_ns, stack.blocks[0].sensor, white, weight, stack.used
 
 
 def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:
@@ -135,10 +131,9 @@ def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Par
     stamps = {row.row: row.t_ns for window in problem.windows for row in window.late.get(sensor, ())}
     parts: list[Part] = []
     for stack in estimate.stacks(sensor) if stamps else ():
-        rows = np.array([row for block in stack.blocks for row in block.rows])
-        late = np.isin(rows, list(stamps))
+        late = np.isin(stack.rows, list(stamps))
         _, _, white, weight, used = _of_stack(stack, estimate)
-        t_ns = np.array([stamps[row] for row in rows[late].tolist()], dtype=np.int64)
+        t_ns = np.array([stamps[row] for row in stack.rows[late].tolist()], dtype=np.int64)
         parts.append((t_ns, sensor, white[late], weight[late], used[late]))
     return parts
 
@@ -147,7 +142,7 @@ def _weights(builder: PositionBuilder, white: Floats) -> Floats:
     """Robust weights (n,) of the loss in force."""
     if builder.config.loss != "huber":
         return np.ones(len(white))
-    return np.asarray(np.minimum(1.0, 1.345 / np.maximum(np.linalg.norm(white, axis=1), 1e-12)))
+    return loss_weights((white**2).sum(axis=1), "huber")[0]
 
 
 def _flat(parts: Sequence[Part]) -> Residuals:

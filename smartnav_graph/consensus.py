@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from smartnav_graph import graduated
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.factors.observation import skew
+from smartnav_graph.first_seconds import inertial_motion
 from smartnav_graph.graph import Window
 from smartnav_graph.timebase import NS
 
@@ -82,16 +83,7 @@ class Agreed:
 
 
 def _integrated(windows: Sequence[Window], bias: Floats) -> tuple[Floats, Floats]:
-    """Specific force integrated twice and once, (n, 3) each, at the end of each window, in the first body frame."""
-    constant = gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
-    pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), constant)
-    integrate, place, speed = pim.integrateMeasurement, [], []
-    for window in windows:
-        for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
-            integrate(accel, gyro, dt)
-        place.append(pim.deltaPij())
-        speed.append(pim.deltaVij())
-    return np.array(place).reshape(-1, 3), np.array(speed).reshape(-1, 3)
+    return inertial_motion(windows, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
 
 
 def curve_of(windows: Sequence[Window], bias: Floats, noise: ImuNoise, bias_sigma: Floats) -> Curve:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.factors.pose_fix import left_jacobian_inverse
+from smartnav_graph.factors.observation import exp, left_jacobian_inverse
+from smartnav_graph.losses import loss_weights
 from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import seconds_since
 
@@ -26,7 +26,6 @@ GRID_S = 0.05  # turns are taken together
 ITERATIONS = 6
 # What a fix's attitude and the body's own may differ by beside noise (an unknown mount), rad.
 SLACK = 0.05
-HUBER = 1.345
 # Sigmas of the bias that may turn the body by half a turn between two attitudes, at most.
 UNAMBIGUOUS = 2.5
 
@@ -67,8 +66,7 @@ def _refined(
     theta = Rotation.from_matrix((R @ D) @ seen.transpose(0, 2, 1)).as_rotvec()
     left = left_jacobian_inverse(theta)
     by = np.concatenate([left, left @ R @ D @ J], axis=2) / SLACK  # R_0 <- Exp(w) R_0
-    size = np.linalg.norm(theta, axis=1) / SLACK
-    root = np.sqrt(np.minimum(1.0, HUBER / np.maximum(size, 1e-12)))[:, None]
+    root = np.sqrt(loss_weights((theta**2).sum(axis=1) / SLACK**2, "huber")[0])[:, None]
     held = np.concatenate([np.zeros((3, 3)), np.eye(3) / bias_sigma], axis=1)
     A = np.concatenate([(by * root[:, :, None]).reshape(-1, 6), held])
     r = np.concatenate([(theta / SLACK * root).ravel(), bias / bias_sigma])

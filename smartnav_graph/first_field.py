@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import ImuNoise, MagnetometerNoise
 from smartnav_graph.factors.observation import exp, skew, turned
+from smartnav_graph.losses import loss_weights
 from smartnav_graph.streams import Imu, Magnetometer
 from smartnav_graph.timebase import NS, interpolate, seconds_since
 
@@ -31,7 +32,6 @@ LONGEST_S = 30.0
 ITERATIONS = 5
 # Acceleration (m/s^2) of a hand-held device beside gravity, and how long (s) it stays alike.
 MOTION, MOTION_S = 1.0, 0.5
-HUBER = 1.345
 # A heading (rad) less sure than this is none.
 SURE_HEADING = 0.5
 BIAS, IRON, UP, FIELD = (slice(3 * i, 3 * i + 3) for i in range(4))
@@ -127,7 +127,7 @@ def fit(there: Seen, x: Floats, prior: Floats, sigma: Floats, noise: Magnetomete
 def _huber(size: Floats) -> Floats:
     """Weights (n,) of residuals by their size over its own robust level."""
     level = max(float(np.median(size)) / 1.54, 1e-9)  # the median norm of three unit normals
-    return np.asarray(np.minimum(1.0, HUBER * np.sqrt(3.0) * level / np.maximum(size, 1e-12)))
+    return loss_weights(size**2, "huber", np.sqrt(3.0) * level)[0]
 
 
 def field_start(

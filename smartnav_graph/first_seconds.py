@@ -84,12 +84,18 @@ def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> 
     return R, line[0], line[1]
 
 
-def inertial_curve(windows: Sequence[Window], bias: gtsam.imuBias.ConstantBias) -> Floats:
-    """Doubly integrated specific force (n, 3) at the end of each window, in the first body frame."""
+def inertial_motion(windows: Sequence[Window], bias: gtsam.imuBias.ConstantBias) -> tuple[Floats, Floats]:
+    """Specific force integrated twice and once, (n, 3) each, at the end of each window, in the first body frame."""
     pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), bias)
-    curve = []
+    integrate, place, speed = pim.integrateMeasurement, [], []
     for window in windows:
         for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
-            pim.integrateMeasurement(accel, gyro, dt)
-        curve.append(pim.deltaPij())
-    return np.array(curve).reshape(-1, 3)
+            integrate(accel, gyro, dt)
+        place.append(pim.deltaPij())
+        speed.append(pim.deltaVij())
+    return np.array(place).reshape(-1, 3), np.array(speed).reshape(-1, 3)
+
+
+def inertial_curve(windows: Sequence[Window], bias: gtsam.imuBias.ConstantBias) -> Floats:
+    """Doubly integrated specific force (n, 3) at the end of each window, in the first body frame."""
+    return inertial_motion(windows, bias)[0]

@@ -109,6 +109,13 @@ class State:
     bias: Any
     covariance: Floats | None = None
 
+    @classmethod
+    def of(cls, index: int, t_ns: int, nav: tuple[Floats, Floats, Floats], bias: Floats) -> State:
+        """Of nav_R_body (3, 3), nav_t_body (3,), nav_v_body (3,) and the biases (6,)."""
+        R, p, v = nav
+        pose = gtsam.Pose3(gtsam.Rot3(R), p)
+        return cls(index, t_ns, gtsam.NavState(pose, v), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+
 
 @dataclass(frozen=True)
 class Window:
@@ -229,6 +236,12 @@ class Step:
         """Key of a session state that a factor of this step touches."""
         self.session[state.key] = state
         return state.key
+
+    def keys(self, letters: Sequence[str], index: int, states: Mapping[str, SessionState]) -> tuple[int, ...]:
+        """Keys of the states that a row model touches: those of keyframe `index`, and session states by letter."""
+        return tuple(
+            self.use(states[letter]) if STATES[letter].scope == "session" else key(letter, index) for letter in letters
+        )
 
     def hold(self, values: Mapping[str, Floats]) -> None:
         """Make constants of the session states named in `values`."""

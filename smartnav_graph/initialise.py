@@ -247,7 +247,7 @@ class Initialiser:
             mean = gtsam.imuBias.ConstantBias(np.zeros(3), rest.gyro)
         held = rest is not None and not self.standstill
         if rest is not None and held:
-            bias[3:] = np.maximum(rest.gyro_sigma, 3e-4)
+            bias[3:] = max(rest.gyro_sigma, LEAST_RATE_SIGMA)
             velocity = np.full(3, REST_SPEED)
         prior = PriorBuilder(
             start=state,
@@ -268,8 +268,7 @@ class Initialiser:
 
     def _state(self, R: Floats, p: Floats, v: Floats, rest: Rest | None, gyro_bias: Floats | None = None) -> State:
         gyro = rest.gyro if rest is not None else np.zeros(3) if gyro_bias is None else gyro_bias
-        bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro)
-        return State(0, self.windows[0].t1_ns, gtsam.NavState(gtsam.Pose3(gtsam.Rot3(R), p), v), bias)
+        return State.of(0, self.windows[0].t1_ns, (R, p, v), np.append(np.zeros(3), gyro))
 
     def _levelled(
         self, heading_deg: float, p: Floats, sigma_m: float, sigma_deg: float, rest: Rest | None
@@ -389,12 +388,10 @@ class Initialiser:
         starts = [(s.nav.attitude().matrix(), s.nav.position(), s.nav.velocity()) for s in states]
         biases = [states[0].bias.vector()] if before or self.field_start is not None else []
         chosen = starts_agreed(windows, t_ns, fixes, starts, known, biases)[: self.config.starts]
-        return [(self._state_of(a), self._memory_of(a, np.flatnonzero(used))) for a in chosen]
-
-    def _state_of(self, agreed: Agreed) -> State:
-        bias = gtsam.imuBias.ConstantBias(agreed.found[:3], agreed.found[3:6])
-        nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(agreed.R), agreed.p), agreed.v)
-        return State(0, self.windows[0].t1_ns, nav, bias)
+        begin = self.windows[0].t1_ns
+        return [
+            (State.of(0, begin, (a.R, a.p, a.v), a.found[:6]), self._memory_of(a, np.flatnonzero(used))) for a in chosen
+        ]
 
     def _memory_of(self, agreed: Agreed, used: NDArray[np.intp]) -> Memory:
         """The rows that disagree as rejected; none where the start explains less than half of them."""
@@ -445,12 +442,7 @@ class Initialiser:
     def _found(self, estimate: Estimate, memory: Memory, rest: Rest | None, count: int) -> Initial:
         """The refined start: its values, under the weak prior (the fixes are used again by the smoother)."""
         R, p, v, bias = (rows[0] for rows in estimate.states())
-        state = State(
-            0,
-            self.windows[0].t1_ns,
-            gtsam.NavState(gtsam.Pose3(gtsam.Rot3(R), p), v),
-            gtsam.imuBias.ConstantBias(bias[:3], bias[3:]),
-        )
+        state = State.of(0, self.windows[0].t1_ns, (R, p, v), bias)
         heading = float(frames.heading_pitch_roll_deg(R, self.forward)[0, 0])
         sigma = float(np.degrees(np.sqrt(estimate.covariance[0, 2, 2])))
         stretch = (self.windows[count - 1].t1_ns - self.windows[0].t1_ns) / NS

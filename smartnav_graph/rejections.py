@@ -11,7 +11,6 @@ from smartnav_graph.graph import Memory
 from smartnav_graph.problem import Problem
 from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.whole_graph import loss_weights
 
 Rejection = Mapping[str, Any]
 
@@ -53,14 +52,12 @@ def _rows(problem: Problem, estimate: Estimate) -> list[Rejection]:
     for sensor in sorted({block.sensor for block in estimate.blocks}):
         for stack in estimate.stacks(sensor):
             white, _ = stack.linearize(estimate.values)
-            square = (white**2).sum(axis=1)
+            size = np.linalg.norm(white, axis=1)
             left_out = ~stack.used
             if stack.loss == "cauchy":
-                left_out |= loss_weights(square, stack.loss)[0] < LEFT_OUT
-            t_ns = np.array([block.t_ns for block in stack.blocks for _ in block.keys])
-            rows = np.array([row for block in stack.blocks for row in block.rows])
+                left_out |= stack.weight(white) < LEFT_OUT
             told += [
-                _entry(problem, int(t_ns[k]), sensor, int(rows[k]), float(np.sqrt(square[k])))
+                _entry(problem, int(stack.t_ns[k]), sensor, int(stack.rows[k]), float(size[k]))
                 for k in np.flatnonzero(left_out)
             ]
     return told

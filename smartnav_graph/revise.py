@@ -65,6 +65,11 @@ class FixResiduals:
     def square(self) -> Floats:
         return np.asarray(((self.residual / self.sigma) ** 2).sum(axis=1))
 
+    @property
+    def redundancy(self) -> Floats:
+        """Share (m, 3) of each component's variance that the solution left."""
+        return np.asarray(np.clip(1.0 - self.posterior / self.sigma**2, 0.0, 1.0))
+
 
 def fix_residuals(
     builder: PositionBuilder, windows: Sequence[Window], estimate: Estimate, memory: Memory
@@ -150,7 +155,7 @@ def _block_verdict(builder: Any, estimate: Estimate) -> list[Verdict]:
     def limit(level: float, probability: float | None) -> Floats:
         return np.full(len(square), chi2(dim).ppf(probability or builder.gate_probability) * max(1.0, level))
 
-    rows = np.array([row for stack in stacks for block in stack.blocks for row in block.rows], dtype=np.intp)
+    rows = np.concatenate([stack.rows for stack in stacks])
     return [Verdict(builder.name, rows, square, dim, limit)]
 
 
@@ -228,7 +233,7 @@ def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], memory: Me
     for name, (_, one) in found.items():
         used = memory.used(name, one.rows)
         square += float(one.square[used].sum())
-        redundancy += float(np.clip(1.0 - one.posterior[used] / one.sigma[used] ** 2, 0.0, 1.0).sum())
+        redundancy += float(one.redundancy[used].sum())
     return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
 
 
@@ -260,8 +265,7 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> 
         return memory
     outside = _position_verdict(builder, found, memory).outside() | memory.rejected.get(builder.name, frozenset())
     used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
-    gain = np.clip(found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0)
-    redundancy = float((1.0 - gain).sum())
+    redundancy = float(found.redundancy[used].sum())
     if not builder.config.estimate_sigma or redundancy < LEAST_REDUNDANCY:
         return memory
     step = float(np.clip(np.sqrt(found.square[used].sum() / redundancy), 0.2, 5.0))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.graph import Builder, Memory
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.whole_graph import Stack, loss_weights
+from smartnav_graph.smoothers.whole_graph import Stack
 
 Floats = NDArray[np.float64]
 
@@ -48,14 +48,14 @@ def _unexplained(stack: Stack, jacobians: list[Floats], estimate: Estimate) -> F
     """Share (m, d) of each residual's variance that the solution left: 1 - J P J^T over pose and velocity."""
     letters = stack.model.letters
     by_state = np.concatenate([jacobians[letters.index("X")], jacobians[letters.index("V")]], axis=2)
-    place = np.searchsorted(estimate.t_ns, [block.t_ns for block in stack.blocks for _ in block.keys])
+    place = np.searchsorted(estimate.t_ns, stack.t_ns)
     P = estimate.marginals.joint[place][:, :9, :9]
     return np.asarray(np.clip(1.0 - np.einsum("mdi,mij,mdj->md", by_state, P, by_state), 0.0, 1.0))
 
 
 def _scales(stack: Stack, groups: Iterable[str], estimate: Estimate, memory: Memory) -> dict[str, float]:
     white, jacobians = stack.linearize(estimate.values)
-    weight = loss_weights((white**2).sum(axis=1), stack.loss, stack.reach)[0] * stack.used
+    weight = stack.weight(white) * stack.used
     left = _unexplained(stack, jacobians, estimate)
     found = {}
     for axis, group in enumerate(groups):

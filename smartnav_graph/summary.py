@@ -69,7 +69,7 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
             continue
         found = fix_residuals(builder, problem.windows, estimate, memory)
         used = memory.used(builder.name, found.rows)
-        redundancy = float(np.clip(1.0 - found.posterior[used] / found.sigma[used] ** 2, 0.0, 1.0).sum())
+        redundancy = float(found.redundancy[used].sum())
         left -= redundancy
         if redundancy > 0.5:
             result[builder.name] = squares.get(builder.name, 0.0) / redundancy

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph.calibration.model import StepNoise
 from smartnav_graph.factors.observation import exp
 from smartnav_graph.factors.step import level_yaw
-from smartnav_graph.graph import State, Window, key
+from smartnav_graph.graph import State, Window
+from smartnav_graph.smoothers.estimate import values_of
 from smartnav_graph.steps import Steps
 from smartnav_graph.timebase import NS, ns_from_seconds
 
@@ -49,19 +50,14 @@ class Walk:
 
     def state(self, row: int = 0) -> State:
         """One keyframe."""
-        nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(self.R[row]), self.p[row]), self.v[row])
-        bias = gtsam.imuBias.ConstantBias(np.zeros(3), self.gyro_bias[row])
-        return State(self.windows[row].index, self.windows[row].t1_ns, nav, bias)
+        window, nav = self.windows[row], (self.R[row], self.p[row], self.v[row])
+        return State.of(window.index, window.t1_ns, nav, np.append(np.zeros(3), self.gyro_bias[row]))
 
     def values(self, count: int | None = None) -> gtsam.Values:
         """Initial values of the first `count` keyframes."""
-        values = gtsam.Values()
-        for row in range(len(self.windows) if count is None else count):
-            state = self.state(row)
-            values.insert(key("X", state.index), state.nav.pose())
-            values.insert(key("V", state.index), state.nav.velocity())
-            values.insert(key("B", state.index), state.bias)
-        return values
+        indices = [window.index for window in self.windows[:count]]
+        bias = np.hstack([np.zeros_like(self.gyro_bias), self.gyro_bias])
+        return values_of(indices, *(rows[: len(indices)] for rows in (self.R, self.p, self.v, bias)))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ ORDER = (
     *("errors", "timebase", "frames", "streams", "calibration", "files", "repair", "session"),
     *("health", "steps", "standstill"),
     *("readers", "simulation", "vision"),
-    *("solution", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
+    *("solution", "losses", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "initialise", "config"),
     *("withhold", "problem", "variance", "row_noise", "revise", "rejections", "assemble", "summary", "estimate"),
     *("evaluation", "intervals", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),

@@ -24,6 +24,7 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
+from smartnav_graph.losses import check_loss
 from smartnav_graph.streams import Barometer
 from smartnav_graph.timebase import NS
 
@@ -46,8 +47,7 @@ class BarometerConfig:
     loss: str = "huber"
 
     def __post_init__(self) -> None:
-        if self.loss not in ("huber", "none"):
-            raise ConfigError("config [barometer]", f"loss = {self.loss!r}", "huber or none")
+        check_loss("barometer", self.loss, ("huber", "none"))
         if self.reference_hpa is not None and not 850.0 < self.reference_hpa < 1100.0:
             raise ConfigError("config [barometer]", f"reference_hpa = {self.reference_hpa}", "850 to 1100 hPa")
         if not self.reference_sigma > 0:

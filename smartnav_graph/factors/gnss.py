@@ -20,9 +20,10 @@ from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.correlated import add_wander, wander_sigma
-from smartnav_graph.factors.observation import AtInstant, AtKeyframe, Partial, here, preintegrated, skew, turned
+from smartnav_graph.factors.observation import Partial, here, preintegrated, row_model, skew, turned
 from smartnav_graph.frames import STANDARD_GRAVITY
 from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Tag, Window, key
+from smartnav_graph.losses import check_loss, robust
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Positioned
 
@@ -57,8 +58,7 @@ class GnssConfig:
     lever_arm_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.loss not in ("gate", "gnc", "huber", "none"):
-            raise ConfigError("config [gnss]", f"loss = {self.loss!r}", "gate, gnc, huber or none")
+        check_loss("gnss", self.loss, ("gate", "gnc", "huber", "none"))
         if not 0.5 < self.gate_probability < 1:
             raise ConfigError("config [gnss]", f"gate_probability = {self.gate_probability}", "between 0.5 and 1")
         if min(self.time_offset_sigma, self.lever_arm_sigma) < 0:
@@ -91,11 +91,8 @@ class PositionFix:
 
 @cache
 def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
-    """The one row model of each kind of fix; where : ``keyframe``, or ``instant`` for a later time."""
-    observation = PositionFix(extra)
-    if not timed and where == "keyframe":
-        return AtKeyframe(observation)
-    return AtInstant(observation, timed=timed, short=where == "keyframe")
+    """The one row model of each kind of fix; where : as in `observation.row_model`."""
+    return row_model(PositionFix(extra), timed=timed, where=where)
 
 
 def clock_state(sensor: str, sigma: float, initial: float = 0.0) -> SessionState:
@@ -115,12 +112,7 @@ def fix_sigmas(stream: Positioned, default: GnssNoise) -> Floats:
 
 def noise_model(sigmas: Floats, loss: str) -> gtsam.noiseModel.Base:
     """Diagonal noise under a loss applied to the whole fix: ``none``, ``huber`` or ``cauchy``."""
-    model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    estimators = gtsam.noiseModel.mEstimator
-    if loss == "none":
-        return model
-    estimator = estimators.Huber.Create(1.345) if loss == "huber" else estimators.Cauchy.Create(1.0)
-    return gtsam.noiseModel.Robust.Create(estimator, model)
+    return robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), loss)
 
 
 @dataclass
@@ -273,21 +265,13 @@ class PositionBuilder:
                 self._add_native(step, row, noise_model(sigma, loss))
             return
         extra = ("C",) * chain + ("L",) * ("L" in states)
-        keys = [key("X", index), key("V", index)]
         where = "keyframe" if index == step.index else "instant"
-        if where == "instant":
-            keys.append(key("B", index))
-        if "T" in states:
-            keys.append(step.use(states["T"]))
-        if chain:
-            keys.append(key("C", index))
-        if "L" in states:
-            keys.append(step.use(states["L"]))
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         model = model_of(extra, "T" in states, where)
-        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, (row,), (used,), loss))
+        keys = step.keys(model.letters, index, states)
+        step.blocks.append(Block(self.name, model, [keys], data[None], step.t_ns, (row,), (used,), loss))
 
     def _softened(self, sigma: Floats, loss: str) -> tuple[Floats, str]:
         """Sigma (3,) and loss of a row as they are used."""

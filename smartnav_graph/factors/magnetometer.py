@@ -28,6 +28,7 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe, exp, skew, turned
 from smartnav_graph.graph import LAST_STAGE, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.losses import check_loss
 from smartnav_graph.streams import Magnetometer
 from smartnav_graph.timebase import NS
 
@@ -62,8 +63,7 @@ class MagnetometerConfig:
     gate_sigmas: float = 4.0
 
     def __post_init__(self) -> None:
-        if self.loss not in ("none", "huber", "cauchy"):
-            raise ConfigError("config [magnetometer]", f"loss = {self.loss!r}", "none, huber or cauchy")
+        check_loss("magnetometer", self.loss)
         if not self.gate_sigmas > 0:
             raise ConfigError("config [magnetometer]", f"gate_sigmas = {self.gate_sigmas}", "> 0")
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.graph import Window
+from smartnav_graph.graph import RowModel, Window
 from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
@@ -73,6 +73,26 @@ def exp(w: Floats) -> Floats:
 def turned(R: Floats, v: Floats) -> Floats:
     """R v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", R, v))
+
+
+def left_jacobian_inverse(theta: Floats) -> Floats:
+    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
+    factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
+
+
+def right_jacobian(theta: Floats) -> Floats:
+    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
+    two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
 
 
 class AtKeyframe:
@@ -217,6 +237,13 @@ class AtInstant:
         residual, by, by_extra = self.observation.observe(there.R, there.p, there.v, rest, own)
         moved = there.by[:2] if self.short else there.by
         return residual, [*(by @ jacobian for jacobian in (*moved, *clock)), *by_extra]
+
+
+def row_model(observation: Observation, *, timed: bool = False, where: str = "keyframe") -> RowModel:
+    """The row model of an observation; where : at a ``keyframe``, or at an ``instant`` after one."""
+    if not timed and where == "keyframe":
+        return AtKeyframe(observation)
+    return AtInstant(observation, timed=timed, short=where == "keyframe")
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,16 @@ from smartnav_graph.calibration.model import GnssNoise
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
-from smartnav_graph.factors.observation import AtInstant, AtKeyframe, Partial, exp, here, preintegrated, skew
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Window, key
+from smartnav_graph.factors.observation import (
+    Partial,
+    exp,
+    here,
+    left_jacobian_inverse,
+    preintegrated,
+    right_jacobian,
+    row_model,
+)
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Window
 from smartnav_graph.session import Session
 from smartnav_graph.streams import PoseFix
 from smartnav_graph.timebase import NS
@@ -68,26 +76,6 @@ def at_their_time(session: Session, config: PoseFixConfig) -> Session:
     return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=fixes.known_ns))
 
 
-def left_jacobian_inverse(theta: Floats) -> Floats:
-    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
-    square = (theta**2).sum(axis=1)
-    angle = np.sqrt(np.maximum(square, 1e-16))
-    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
-    factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
-    cross = skew(theta)
-    return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
-
-
-def right_jacobian(theta: Floats) -> Floats:
-    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
-    square = (theta**2).sum(axis=1)
-    angle = np.sqrt(np.maximum(square, 1e-16))
-    one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
-    two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
-    cross = skew(theta)
-    return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
-
-
 class AttitudeFix:
     """Data: nav_R_sensor (9), body_R_sensor (9), sigma (3) rad nav axes. `extra`: A turns the sensor in its mount."""
 
@@ -112,11 +100,8 @@ class AttitudeFix:
 
 @cache
 def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
-    """The one row model of each kind of row; where : ``keyframe``, or ``instant`` for a later time."""
-    observation = AttitudeFix(extra)
-    if not timed and where == "keyframe":
-        return AtKeyframe(observation)
-    return AtInstant(observation, timed=timed, short=where == "keyframe")
+    """The one row model of each kind of row; where : as in `observation.row_model`."""
+    return row_model(AttitudeFix(extra), timed=timed, where=where)
 
 
 @dataclass
@@ -195,18 +180,14 @@ class AttitudeBuilder:
         partial: Partial | None,
     ) -> None:
         where = "keyframe" if index == step.index else "instant"
-        keys = [key("X", index), key("V", index)]
-        if where == "instant":
-            keys.append(key("B", index))
-        keys += [step.use(states[letter]) for letter in "TA" if letter in states]
         sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
         data = np.concatenate([self.attitude[row].ravel(), self.mount.ravel(), sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         used = not (memory.is_rejected(self.name, row) or memory.is_rejected(NAME, row))
         model = model_of(("A",) * ("A" in states), "T" in states, where)
-        loss = self._loss(memory)
-        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, (row,), (used,), loss))
+        keys, loss = step.keys(model.letters, index, states), self._loss(memory)
+        step.blocks.append(Block(self.name, model, [keys], data[None], step.t_ns, (row,), (used,), loss))
 
     def _loss(self, memory: Memory) -> str:
         """Loss in the phase at hand; see `Memory`."""

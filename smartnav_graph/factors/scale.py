@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.factors.observation import exp, foretold, skew, turned
+from smartnav_graph.factors.observation import exp, foretold, left_jacobian_inverse, right_jacobian, skew, turned
 from smartnav_graph.graph import Block, SessionState, Step, Window, key
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,7 @@ def integrated(window: Window, bias: Floats) -> Integrated:
     for k, turn in enumerate(turns):
         R[k + 1] = R[k] @ turn
     force = turned(R[:-1], accel)
-    by_rate = R[1:] @ _right_jacobian(gyro * dt[:, None]) * dt[:, None, None]
+    by_rate = R[1:] @ right_jacobian(gyro * dt[:, None]) * dt[:, None, None]
     before = np.zeros((len(dt), 3, 12))  # gyro bias, then M_g
     change = np.concatenate([-by_rate, _outer(by_rate, gyro)], axis=2)
     before[1:] = np.cumsum(change, axis=0)[:-1]
@@ -90,18 +90,6 @@ def _outer(columns: Floats, reading: Floats) -> Floats:
     return np.asarray(np.einsum("nir,nc->nirc", columns, reading).reshape(-1, 3, 9))
 
 
-def _right_jacobian(w: Floats) -> Floats:
-    """Exp(w + d) = Exp(w) Exp(Jr d) to first order; (m, 3, 3), series good to 1e-6 up to 0.1 rad."""
-    K = skew(w)
-    return np.asarray(np.eye(3) - 0.5 * K + K @ K / 6.0)
-
-
-def _inverse_right_jacobian(w: Floats) -> Floats:
-    """Log(Exp(w) Exp(d)) = w + Jr^-1 d; (m, 3, 3), series good to 1e-6 up to 0.2 rad."""
-    K = skew(w)
-    return np.asarray(np.eye(3) + 0.5 * K + K @ K / 12.0)
-
-
 _AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 9 * _STATES, "bias": _STATES, "gravity": 1, "root": 81}
 
 
@@ -121,13 +109,13 @@ class ScaledWindow:
         dp, dv = turned(back, pose_j[:, :3, 3] - there.p), turned(back, velocity_j - there.v)
         m = len(pose)
         by_there = np.zeros((m, 9, 9))
-        by_there[:, :3, :3] = -_inverse_right_jacobian(-turn)
+        by_there[:, :3, :3] = -left_jacobian_inverse(turn)
         by_there[:, 3:6, 3:6] = by_there[:, 6:, 6:] = -back
         by_pose, by_velocity, by_rest = (by_there @ jacobian for jacobian in there.by)
         by_pose[:, 3:6, :3] += skew(dp)
         by_pose[:, 6:, :3] += skew(dv)
         after, speed = np.zeros((m, 9, 6)), np.zeros((m, 9, 3))
-        after[:, :3, :3] = _inverse_right_jacobian(turn)
+        after[:, :3, :3] = left_jacobian_inverse(-turn)
         after[:, 3:6, 3:] = back @ Rj
         speed[:, 6:] = back
         root = at["root"].reshape(m, 9, 9)
@@ -152,7 +140,7 @@ def columns(window: Window, bias: Floats, covariance: Floats, gravity: float) ->
     """Data of one row; covariance (9, 9) of GTSAM's preintegrated [rotation vector, position, velocity]."""
     found = integrated(window, bias)
     turn = np.eye(9)
-    turn[:3, :3] = _right_jacobian(Rotation.from_matrix(found.dR).as_rotvec()[None])[0]
+    turn[:3, :3] = right_jacobian(Rotation.from_matrix(found.dR).as_rotvec()[None])[0]
     root = np.linalg.inv(np.linalg.cholesky(turn @ covariance @ turn.T))
     base = np.concatenate([bias, np.zeros(_STATES - 6)])
     parts = ([window.dt.sum()], found.dR, found.dp, found.dv, found.by, base, [gravity], root)

@@ -28,6 +28,7 @@ from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe, skew, turned
 from smartnav_graph.graph import STATES, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.losses import check_loss
 from smartnav_graph.standstill import Standstills
 from smartnav_graph.timebase import NS, Gap
 
@@ -56,8 +57,7 @@ class VehicleConfig:
     def __post_init__(self) -> None:
         if not min(self.period_s, self.mount_sigma_deg, self.lever_sigma, self.compliance_sigma) > 0:
             raise ConfigError("config [vehicle]", "a period or sigma <= 0", "> 0")
-        if self.loss not in ("none", "huber", "cauchy"):
-            raise ConfigError("config [vehicle]", f"loss = {self.loss!r}", "none, huber or cauchy")
+        check_loss("vehicle", self.loss)
 
     @property
     def prior_sigma(self) -> Floats:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.gnss import GnssConfig, clock_state
 from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here, skew, turned
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.graph import LAST_STAGE, Block, Memory, State, Step, Window, key
+from smartnav_graph.losses import check_loss
 from smartnav_graph.streams import Velocity
 from smartnav_graph.timebase import NS
 
@@ -41,8 +42,7 @@ class VelocityConfig:
     def __post_init__(self) -> None:
         if not self.default_sigma > 0:
             raise ConfigError("config [velocity]", f"default_sigma = {self.default_sigma}", "> 0 m/s")
-        if self.loss not in ("none", "huber", "cauchy"):
-            raise ConfigError("config [velocity]", f"loss = {self.loss!r}", "none, huber or cauchy")
+        check_loss("velocity", self.loss)
 
 
 class NavVelocity:
@@ -81,11 +81,6 @@ class BodyVelocity:
         return (body + data[:, 3:6] - data[:, :3]) * weight, by_state * weight[:, :, None], []
 
 
-def clock_state(sensor: str, config: GnssConfig) -> SessionState:
-    """The clock offset that a receiver's fixes and velocities share."""
-    return SessionState("T", sensor, f"{sensor}_time_offset_s", np.zeros(1), np.array([config.time_offset_sigma]))
-
-
 NAV_MODEL = AtKeyframe(NavVelocity())
 NAV_MODEL_TIMED = AtInstant(NavVelocity(), timed=True)
 BODY_MODEL = AtKeyframe(BodyVelocity())
@@ -122,7 +117,7 @@ class GnssVelocityBuilder:
         tail = np.zeros(0)
         timed = memory.stage >= LAST_STAGE and self.gnss.time_offset_sigma > 0 and len(window.dt) > 0
         if timed:
-            states = (*states, key("B", step.index), step.use(clock_state("gnss", self.gnss)))
+            states = (*states, key("B", step.index), step.use(clock_state("gnss", self.gnss.time_offset_sigma)))
             tail = here(step.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
         data = np.array([np.concatenate([self.velocity[row], arm, self.sigma[row], tail]) for row in rows])
         used = tuple(bool(known) for known in memory.used("gnss", np.array(rows, dtype=np.intp)))

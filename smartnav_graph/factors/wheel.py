@@ -29,6 +29,7 @@ from smartnav_graph.factors.vehicle import (
     recent,
 )
 from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Window, key
+from smartnav_graph.losses import check_loss
 from smartnav_graph.streams import WheelSpeed
 from smartnav_graph.timebase import NS
 
@@ -56,8 +57,7 @@ class WheelConfig:
             raise ConfigError("config [wheel]", "a sigma <= 0", "> 0")
         if self.period_s < 2 * HALF_LINE_S:
             raise ConfigError("config [wheel]", f"period_s = {self.period_s}", f">= {2 * HALF_LINE_S} s")
-        if self.loss not in ("none", "huber", "cauchy"):
-            raise ConfigError("config [wheel]", f"loss = {self.loss!r}", "none, huber or cauchy")
+        check_loss("wheel", self.loss)
 
 
 class RearWheels:

@@ -90,8 +90,15 @@ class Estimate:
 
     def stacks(self, sensor: str) -> list[Stack]:
         """The blocks of one sensor, joined; see `Stack.linearize` for their residuals."""
+        return self._stacks.get(sensor, [])
+
+    @cached_property
+    def _stacks(self) -> Mapping[str, list[Stack]]:
         held = {state.key: state.value for state in self.session.values() if state.held}
-        return stacks_of((block for block in self.blocks if block.sensor == sensor), held)
+        found: dict[str, list[Stack]] = {}
+        for stack in stacks_of(self.blocks, held):
+            found.setdefault(stack.blocks[0].sensor, []).append(stack)
+        return found
 
     @cached_property
     def _states(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -127,6 +134,17 @@ def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floa
     velocity = np.array([values.atVector(key("V", i)) for i in indices]).reshape(-1, 3)
     bias = np.array([values.atConstantBias(key("B", i)).vector() for i in indices]).reshape(-1, 6)
     return stacked[:, :3, :3], stacked[:, :3, 3], velocity, bias
+
+
+def values_of(indices: Sequence[int], R: Floats, p: Floats, v: Floats, bias: Floats) -> gtsam.Values:
+    """gtsam.Values of keyframe states; the inverse of `states_of`."""
+    values = gtsam.Values()
+    for index, *nav, b in zip(indices, R, p, v, bias, strict=True):
+        state = State.of(index, 0, (nav[0], nav[1], nav[2]), b)
+        values.insert(key("X", index), state.nav.pose())
+        values.insert(key("V", index), state.nav.velocity())
+        values.insert(key("B", index), state.bias)
+    return values
 
 
 def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -10,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.graph import STATES, Block, RowModel, SessionState, Step
+from smartnav_graph.losses import loss_weights, robust
 
 Floats = NDArray[np.float64]
 Held = Mapping[int, Floats]
-
-
-HUBER = 1.345  # keeps 95 % efficiency on Gaussian residuals (Holland, Welsch 1977)
 
 
 def value_of(values: Any, letter: str, name: int) -> Floats:
@@ -42,21 +41,6 @@ class Snapshot:
         return np.array([self._found[name] for name in names])
 
 
-def loss_weights(square: Floats, loss: str, reach: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1), for
-    norms in units of `reach` (m,)."""
-    if loss == "none":
-        return np.ones_like(square), 0.5 * square
-    scale = np.square(reach)
-    square = square / scale
-    if loss == "cauchy":
-        return 1.0 / (1.0 + square), 0.5 * scale * np.log1p(square)
-    norm = np.sqrt(np.maximum(square, 1e-300))
-    outside = norm > HUBER
-    cost = np.where(outside, HUBER * norm - 0.5 * HUBER**2, 0.5 * square)
-    return np.where(outside, HUBER / norm, 1.0), scale * cost
-
-
 class Stack:
     """All rows of one model under one loss; `blocks` gives each row's origin."""
 
@@ -67,6 +51,20 @@ class Stack:
         self.reach = np.repeat([block.reach for block in blocks], [len(block.keys) for block in blocks])
         self.used = np.array([used for block in blocks for used in block.used], dtype=bool)
         self.data = np.concatenate([block.data for block in blocks])
+
+    @cached_property
+    def t_ns(self) -> NDArray[np.int64]:
+        """Time (m,) of each row."""
+        return np.array([block.t_ns for block in self.blocks for _ in block.keys], dtype=np.int64)
+
+    @cached_property
+    def rows(self) -> NDArray[np.intp]:
+        """Row (m,) of the stream behind each, -1 where there is none."""
+        return np.array([row for block in self.blocks for row in block.rows], dtype=np.intp)
+
+    def weight(self, residual: Floats) -> Floats:
+        """Weight (m,) of the loss on whitened residuals (m, d)."""
+        return loss_weights((residual**2).sum(axis=1), self.loss, self.reach)[0]
 
     def linearize(self, values: Any) -> tuple[Floats, list[Floats]]:
         """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss.
@@ -85,7 +83,7 @@ class Stack:
     def add_to(self, linear: Any, values: Any) -> None:
         """Append one linear factor a used row; held states and states that nothing depends on have no column."""
         residual, jacobians = self.linearize(values)
-        root = np.sqrt(loss_weights((residual**2).sum(axis=1), self.loss, self.reach)[0])
+        root = np.sqrt(self.weight(residual))
         free = [i for i, jacobian in enumerate(jacobians) if self.keys[0][i] not in self.held and jacobian.any()]
         augmented = np.concatenate([*(jacobians[i] for i in free), -residual[:, :, None]], axis=2)
         augmented *= root[:, None, None]
@@ -175,15 +173,8 @@ def custom_factor(block: Block, row: int, held: Held) -> Any:
 
     if model not in _SIZES:
         _SIZES[model] = len(model.linearize([_zero(letter) for letter in model.letters], data)[0][0])
-    return gtsam.CustomFactor(_noise(_SIZES[model], block.loss, block.reach), [keys[i] for i in free], error)
-
-
-def _noise(dim: int, loss: str, reach: float) -> Any:
-    unit, estimators = gtsam.noiseModel.Unit.Create(dim), gtsam.noiseModel.mEstimator
-    if loss == "none":
-        return unit
-    estimator = estimators.Huber.Create(HUBER * reach) if loss == "huber" else estimators.Cauchy.Create(reach)
-    return gtsam.noiseModel.Robust.Create(estimator, unit)
+    noise = robust(gtsam.noiseModel.Unit.Create(_SIZES[model]), block.loss, block.reach)
+    return gtsam.CustomFactor(noise, [keys[i] for i in free], error)
 
 
 def _zero(letter: str) -> Floats:

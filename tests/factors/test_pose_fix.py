@@ -13,14 +13,12 @@ from smartnav_graph import estimate
 from smartnav_graph.calibration.model import DEVICE_CLASSES
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.factors.observation import exp
+from smartnav_graph.factors.observation import exp, left_jacobian_inverse, right_jacobian
 from smartnav_graph.factors.pose_fix import (
     AttitudeFix,
     PoseFixConfig,
     at_their_time,
     attitudes,
-    left_jacobian_inverse,
-    right_jacobian,
 )
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.streams import PoseFix

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from smartnav_graph.graph import Block, SessionState, Step, key
+from smartnav_graph.losses import loss_weights
 from smartnav_graph.smoothers.whole_graph import (
     Snapshot,
     Stack,
     WholeGraph,
     custom_factor,
     linear_factor,
-    loss_weights,
     session_prior,
     stacks_of,
     value_of,

@@ -1,0 +1,54 @@
+"""Losses of measurements: least squares, Huber, Cauchy. On the norm of a row, in units of its sigma.
+
+Source: Huber (1964), Robust estimation of a location parameter; Holland, Welsch (1977), Robust regression using
+iteratively reweighted least-squares, for the constants.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+
+Floats = NDArray[np.float64]
+
+LOSSES = ("none", "huber", "cauchy")
+HUBER = 1.345  # keeps 95 % efficiency on Gaussian residuals
+
+
+def check_loss(section: str, loss: str, known: tuple[str, ...] = LOSSES) -> None:
+    """Refuse the loss of a section of the configuration that is none of `known`.
+
+    Raises
+    ------
+    ConfigError
+        It is not.
+    """
+    if loss not in known:
+        raise ConfigError(f"config [{section}]", f"loss = {loss!r}", f"{', '.join(known[:-1])} or {known[-1]}")
+
+
+def loss_weights(square: Floats, loss: str, reach: Floats | float = 1.0) -> tuple[Floats, Floats]:
+    """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1), for
+    norms in units of `reach` (m,)."""
+    if loss == "none":
+        return np.ones_like(square), 0.5 * square
+    scale = np.square(reach)
+    square = square / scale
+    if loss == "cauchy":
+        return 1.0 / (1.0 + square), 0.5 * scale * np.log1p(square)
+    norm = np.sqrt(np.maximum(square, 1e-300))
+    outside = norm > HUBER
+    cost = np.where(outside, HUBER * norm - 0.5 * HUBER**2, 0.5 * square)
+    return np.where(outside, HUBER / norm, 1.0), scale * cost
+
+
+def robust(model: gtsam.noiseModel.Base, loss: str, reach: float = 1.0) -> gtsam.noiseModel.Base:
+    """A GTSAM noise model under a loss, as `loss_weights` has it."""
+    if loss == "none":
+        return model
+    estimators = gtsam.noiseModel.mEstimator
+    estimator = estimators.Huber.Create(HUBER * reach) if loss == "huber" else estimators.Cauchy.Create(reach)
+    return gtsam.noiseModel.Robust.Create(estimator, model)
