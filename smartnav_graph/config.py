@@ -24,13 +24,13 @@ from smartnav_graph.factors.step import StepConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
 from smartnav_graph.factors.velocity import VelocityConfig
 from smartnav_graph.factors.wheel import WheelConfig
-from smartnav_graph.initialise import InitialiseConfig
 from smartnav_graph.keyframes import KeyframeConfig
 from smartnav_graph.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
 from smartnav_graph.standstill import StandstillConfig
+from smartnav_graph.start import InitialiseConfig
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ import numpy as np
 from smartnav_graph.assemble import Withheld, used_counts
 from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
-from smartnav_graph.initialise import Initial
 from smartnav_graph.problem import Problem
 from smartnav_graph.rejections import rejections
 from smartnav_graph.revise import OBSERVED, fix_residuals, position_builders
 from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
+from smartnav_graph.start import Initial
 from smartnav_graph.variance import NOISE_NAMES
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
