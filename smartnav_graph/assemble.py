@@ -179,13 +179,25 @@ def score(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str
         rows = stream.take(inside)
         if not len(rows):
             continue
-        t_ns = rows.t_ns + round(estimate.offset_s(name) * NS)
-        known = np.clip(t_ns, keyframes.t_ns[0], keyframes.t_ns[-1])
-        there = states_at(problem.windows, kinematics(keyframes), problem.session.gravity, known)
         lever = problem.session.lever_arms(rows) + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
-        p = there.p + there.v * ((t_ns - known) / NS)[:, None] + turned(there.R, lever)
+        p = sensed(problem, keyframes, rows.t_ns, estimate.offset_s(name), lever)
         scored[name] = Withheld(rows.t_ns, p - problem.session.nav_position(rows))
     return scored
+
+
+def sensed(problem: Problem, solution: Solution, t_ns: NDArray[np.int64], offset_s: float, lever: Floats) -> Floats:
+    """Position (n, 3) nav m of a sensor whose clock is off by `offset_s`, at lever arms (n, 3) or (3,) m body axes, at
+    its own stamps t_ns (n,)."""
+    shifted = t_ns + round(offset_s * NS)
+    known = np.clip(shifted, solution.t_ns[0], solution.t_ns[-1])
+    there = states_at(problem.windows, kinematics(solution), problem.session.gravity, known)
+    return placed(there, (shifted - known) / NS, lever)
+
+
+def placed(there: Kinematics, ahead_s: Floats, lever: Floats) -> Floats:
+    """Positions (n, 3) of a sensor at lever arms (n, 3) or (3,), `ahead_s` (n,) after states by velocity alone."""
+    arms = np.broadcast_to(lever, there.p.shape)
+    return np.asarray(there.p + there.v * ahead_s[:, None] + turned(there.R, arms))
 
 
 def densify(problem: Problem, keyframes: Solution) -> Solution:

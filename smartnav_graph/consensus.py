@@ -213,30 +213,61 @@ class Known:
     fix_sigma: float
 
 
+Start = tuple[Floats, Floats, Floats]  # attitude, position, velocity
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Windows, the fixes (m, 3) at t_ns (m,) in them, and what is known before."""
+
+    windows: Sequence[Window]
+    t_ns: NDArray[np.int64]
+    fixes: Floats
+    known: Known
+
+    def agreed(self, bias: Floats, starts: Sequence[Start]) -> list[Agreed]:
+        """The state that most fixes agree on from each start, on the curve integrated at a bias (6,)."""
+        known, ends = self.known, np.array([w.t1_ns for w in self.windows])
+        curve = curve_of(self.windows, bias, known.noise, known.bias_sigma)
+        rows = np.minimum(np.searchsorted(ends, self.t_ns), len(self.windows) - 1)
+        t = (self.t_ns - ends[0]) / NS
+        problem = Agreement(curve.at(rows), self.fixes, t, known.fix_sigma, known.gravity, known.bias_mean)
+        return [problem.agree(*start) for start in starts]
+
+    def first_seconds(self) -> _Stretch | None:
+        """The part in which even a bad rate turns the curve little; None where it holds too few fixes."""
+        ends = np.array([w.t1_ns for w in self.windows])
+        until = max(int(self.t_ns[0]), int(ends[0])) + round(SHORT_S * NS)
+        short = int(np.searchsorted(ends, until, side="right"))
+        early = self.t_ns <= ends[max(short - 1, 0)]
+        if early.sum() < LEAST_FIXES or short >= len(self.windows):
+            return None
+        return _Stretch(self.windows[:short], self.t_ns[early], self.fixes[early], self.known)
+
+
 def starts_agreed(
     windows: Sequence[Window],
     t_ns: NDArray[np.int64],
     fixes: Floats,
-    starts: Sequence[tuple[Floats, Floats, Floats]],
+    starts: Sequence[Start],
     known: Known,
-    biases: Sequence[Floats] = (),
+    bias: Floats | None = None,
 ) -> list[Agreed]:
     """The different states that most fixes (m, 3) at t_ns (m,) agree on, cheapest first, from starts (attitude,
-    position, velocity). The curve is integrated at the bias known before, at those of `biases` (6,), and at that of the
+    position, velocity). The curve is integrated at `bias` (6,), by default the mean known before, and at that of the
     first seconds, because a rate wrong by degrees a second bends it beyond what a derivative tells; and for the best
     once more at the bias they found."""
-    points = [*biases, known.bias_mean][:1]
-    first = _first_bias(windows, t_ns, fixes, starts, known)
+    stretch, points = _Stretch(windows, t_ns, fixes, known), [known.bias_mean if bias is None else bias]
+    first = _first_bias(stretch, starts)
     if _far(first, points):
         points.append(first)
-    found = distinct([state for at in points for state in _agreed_at(at, windows, t_ns, fixes, starts, known)])
+    found = distinct([state for at in points for state in stretch.agreed(at, starts)])
     again = []
     for state in found[:BEST]:
         for _ in range(ROUNDS - 1):
             if _far(state.found[:6], points):
                 points.append(state.found[:6])
-                start = (state.R, state.p, state.v)
-                state = _agreed_at(state.found[:6], windows, t_ns, fixes, [start], known)[0]
+                state = stretch.agreed(state.found[:6], [(state.R, state.p, state.v)])[0]
         again.append(state)
     return distinct([*again, *found[BEST:]])
 
@@ -246,43 +277,17 @@ def _far(bias: Floats, points: Sequence[Floats]) -> bool:
     return all(np.abs(bias - point)[3:].max() > MOVED for point in points)
 
 
-def _first_bias(
-    windows: Sequence[Window],
-    t_ns: NDArray[np.int64],
-    fixes: Floats,
-    starts: Sequence[tuple[Floats, Floats, Floats]],
-    known: Known,
-) -> Floats:
-    """Biases (6,) by the first seconds, in which even a bad rate turns the curve little."""
-    ends = np.array([w.t1_ns for w in windows])
-    short = int(np.searchsorted(ends, max(int(t_ns[0]), int(ends[0])) + round(SHORT_S * NS), side="right"))
-    early = t_ns <= ends[max(short - 1, 0)]
-    bias = known.bias_mean
-    if early.sum() < LEAST_FIXES or short >= len(windows):
+def _first_bias(stretch: _Stretch, starts: Sequence[Start]) -> Floats:
+    """Biases (6,) by the first seconds."""
+    bias, short = stretch.known.bias_mean, stretch.first_seconds()
+    if short is None:
         return bias
     for _ in range(ROUNDS):
         before = bias
-        states = _agreed_at(bias, windows[:short], t_ns[early], fixes[early], starts, known)
-        bias = min(states, key=lambda state: state.cost).found[:6]
+        bias = min(short.agreed(bias, starts), key=lambda state: state.cost).found[:6]
         if not _far(bias, [before]):
             break
     return bias
-
-
-def _agreed_at(
-    bias: Floats,
-    windows: Sequence[Window],
-    t_ns: NDArray[np.int64],
-    fixes: Floats,
-    starts: Sequence[tuple[Floats, Floats, Floats]],
-    known: Known,
-) -> list[Agreed]:
-    ends = np.array([w.t1_ns for w in windows])
-    curve = curve_of(windows, bias, known.noise, known.bias_sigma)
-    rows = np.minimum(np.searchsorted(ends, t_ns), len(windows) - 1)
-    t = (t_ns - ends[0]) / NS
-    problem = Agreement(curve.at(rows), fixes, t, known.fix_sigma, known.gravity, known.bias_mean)
-    return [problem.agree(*start) for start in starts]
 
 
 def distinct(states: Sequence[Agreed]) -> list[Agreed]:

@@ -51,13 +51,15 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class Run:
-    """Everything one run gives. `summary` is what summary.json holds."""
+    """Everything one run gives. `summary` is what summary.json holds; `causal_windows` are those that a replay went
+    through, one a row of `causal`."""
 
     problem: Problem
     solution: Solution
     summary: Mapping[str, Any]
     causal: Solution | None = None
     withheld: Mapping[str, Withheld] = field(default_factory=dict)
+    causal_windows: Sequence[Window] = ()
 
     @property
     def session(self) -> Session:
@@ -275,7 +277,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     clock.lap("replay")
     problem = _counted(replace(problem, windows=problem.windows[: len(states)]), smoother.dropped)
     estimate = smoother.estimate(len(states))
-    causal = causal_solution(problem, states)
+    causal, windows = causal_solution(problem, states), problem.windows
     extra: dict[str, Any] = {
         "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
         "update_ms": {name: float(f(latency)) for name, f in _LATENCY.items()},
@@ -288,7 +290,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         except KeyboardInterrupt:
             extra["mode"] += ", polish interrupted"
         clock.lap("polish")
-    return _finish(problem, initial, estimate, memory, clock, extra, causal)
+    return replace(_finish(problem, initial, estimate, memory, clock, extra, causal), causal_windows=windows)
 
 
 def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:

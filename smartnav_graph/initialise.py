@@ -312,8 +312,8 @@ class Initialiser:
         known = Known(mean, sigma, self.noise, self.gravity, self.fix_sigma)
         states = [*before, *self._starts(count, rest)]
         starts = [(s.nav.attitude().matrix(), s.nav.position(), s.nav.velocity()) for s in states]
-        biases = [states[0].bias.vector()] if before or self.field_start is not None else []
-        chosen = starts_agreed(windows, t_ns, fixes, starts, known, biases)[: self.config.starts]
+        bias = states[0].bias.vector() if before or self.field_start is not None else None
+        chosen = starts_agreed(windows, t_ns, fixes, starts, known, bias)[: self.config.starts]
         begin = self.windows[0].t1_ns
         return [
             (State.of(0, begin, (a.R, a.p, a.v), a.found[:6]), self._memory_of(a, np.flatnonzero(used))) for a in chosen

@@ -24,14 +24,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import estimate
-from smartnav_graph.assemble import kinematics
+from smartnav_graph.assemble import kinematics, placed, sensed
 from smartnav_graph.config import Config
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.estimate import Run
 from smartnav_graph.evaluation.metrics import Statistics
-from smartnav_graph.graph import Window
-from smartnav_graph.prediction import Kinematics, foretold_at, states_at
-from smartnav_graph.problem import prepare
+from smartnav_graph.prediction import foretold_at
 from smartnav_graph.session import Session
 from smartnav_graph.streams import ABSOLUTE, PoseFix, Reference
 from smartnav_graph.timebase import NS, nearest
@@ -191,7 +189,6 @@ def _scored(
     """One replay, and its three rows."""
     config = replace(config, run=replace(config.run, rate="keyframes"))
     run = estimate.replay(session, config)
-    windows = prepare(session, config, causal=True).windows
     sensor = Sensor.of(run) if made else Sensor()
     times = _fix_times(run.session)
     between = (reference.t_ns > times[0]) & (reference.t_ns < times[-1]) & ~np.isin(reference.t_ns, times)
@@ -205,7 +202,7 @@ def _scored(
             truth = truth.take(truth.t_ns > run.solution.t_ns[0] + round(run.summary["delay_s"] * NS))
         if not len(truth):
             raise SessionError("reference", f"has no row for {kind} between the fixes", "one clock for both")
-        found = sensor.smoothed(run, truth.t_ns) if kind == "smoothed" else sensor.causal(run, windows, truth.t_ns)
+        found = sensor.smoothed(run, truth.t_ns) if kind == "smoothed" else sensor.causal(run, truth.t_ns)
         yield Interval.of(every_s, kind, seed, found - truth.enu)
 
 
@@ -232,18 +229,11 @@ class Sensor:
 
     def smoothed(self, run: Run, t_ns: Times) -> Floats:
         """Its position (n, 3) in the smoothed solution."""
-        first, last = (int(t) for t in run.solution.t_ns[[0, -1]])
-        shifted = t_ns + round(self.offset_s * NS)
-        known = np.clip(shifted, first, last)
-        there = states_at(run.problem.windows, kinematics(run.solution), run.session.gravity, known)
-        return self._placed(there, (shifted - known) / NS)
+        return sensed(run.problem, run.solution, t_ns, self.offset_s, np.array(self.lever))
 
-    def causal(self, run: Run, windows: Sequence[Window], t_ns: Times) -> Floats:
+    def causal(self, run: Run, t_ns: Times) -> Floats:
         """Its position (n, 3) as foretold by the keyframe before `t_ns`: nothing later is looked at, so the offset is
-        bridged by the velocity alone. `windows` are those of the replay."""
+        bridged by the velocity alone."""
         assert run.causal is not None  # of a replay
-        there = foretold_at(windows[: len(run.causal)], kinematics(run.causal), run.session.gravity, t_ns)
-        return self._placed(there, np.full(len(t_ns), self.offset_s))
-
-    def _placed(self, there: Kinematics, ahead_s: Floats) -> Floats:
-        return np.asarray(there.p + there.v * ahead_s[:, None] + there.R @ np.array(self.lever))
+        there = foretold_at(run.causal_windows, kinematics(run.causal), run.session.gravity, t_ns)
+        return placed(there, np.full(len(t_ns), self.offset_s), np.array(self.lever))
