@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import cattrs
 import tomli_w
 
+from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import CalibrationError
 
 
@@ -176,7 +178,7 @@ class ImuErrors:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Device calibration as it stands in calibration.toml."""
+    """Device calibration as it stands in calibration.toml; `cameras` by the name that images carry."""
 
     device: str = "unknown"
     device_class: str = "mems"
@@ -187,6 +189,7 @@ class Calibration:
     step_noise: StepNoise = field(default_factory=StepNoise)
     magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for room in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
