@@ -1,0 +1,1 @@
+"""Images -> points, pairs, relative geometry."""
