@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 
 class Sampson(NamedTuple):
-    """Residuals (m,) and their derivatives (m, 3) by rotation (R <- R Exp(w)) and by translation."""
+    """Residuals (..., m) and their derivatives (..., m, 3) by rotation (R <- R Exp(w)) and by translation."""
 
     residual: Floats
     by_rotation: Floats
@@ -32,8 +32,8 @@ class Sampson(NamedTuple):
 
 
 def rays(xy_n: Floats) -> Floats:
-    """Homogeneous coordinates (m, 3) of points (m, 2)."""
-    return np.column_stack([xy_n, np.ones(len(xy_n))])
+    """Homogeneous coordinates (..., 3) of points (..., 2)."""
+    return np.concatenate([xy_n, np.ones((*xy_n.shape[:-1], 1))], axis=-1)
 
 
 def essential(R: Floats, t: Floats) -> Floats:
@@ -42,42 +42,35 @@ def essential(R: Floats, t: Floats) -> Floats:
 
 
 def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0) -> Sampson:
-    """How far matches miss the epipolar geometry of their cameras.
+    """How far the matches of a pair, or of many pairs, miss the epipolar geometry of their cameras.
 
     Parameters
     ----------
-    R : (m, 3, 3) or (3, 3), c0_R_c1
-    t : (m, 3) or (3,), c0_t_c1; without a floor only its direction matters
-    x0, x1 : (m, 2) undistorted normalised coordinates
+    R : (..., 3, 3) c0_R_c1; t : (..., 3) c0_t_c1, of which only the direction matters without a floor
+    x0, x1 : (..., m, 2) undistorted normalised coordinates
     floor : length in units of t, below which a baseline says little
     """
-    a, b = rays(x0), rays(x1)
-    y = _turned(R, b)
-    t = np.broadcast_to(t, y.shape)
-    l0 = np.cross(t, y)
-    l1 = _turned_back(R, np.cross(a, t))
+    a, b, t, back = rays(x0), rays(x1), t[..., None, :], R
+    R = np.swapaxes(R, -1, -2)  # x @ R turns rows
+    y = b @ R
+    l0 = cross(t, y)
+    l1 = cross(a, t) @ back
     g0, g1 = _flat(l0), _flat(l1)
-    e = np.einsum("mi,mi->m", a, l0)
-    square = np.einsum("mi,mi->m", g0, g0) + np.einsum("mi,mi->m", g1, g1) + floor**2
+    e = (a * l0).sum(axis=-1)
+    square = (g0 * g0).sum(axis=-1) + (g1 * g1).sum(axis=-1) + floor**2
     s = np.sqrt(np.maximum(square, np.finfo(float).tiny))
-    shrink = (e / s**2)[:, None]
-    by_t = np.cross(y, a) - shrink * (np.cross(y, g0) - np.cross(a, _turned(R, g1)))
-    by_w = np.cross(b, l1) - shrink * (np.cross(b, _turned_back(R, np.cross(g0, t))) - np.cross(l1, g1))
-    return Sampson(e / s, by_w / s[:, None], by_t / s[:, None])
+    shrink = (e / s**2)[..., None]
+    by_t = cross(y, a) - shrink * (cross(y, g0) - cross(a, g1 @ R))
+    by_w = cross(b, l1) - shrink * (cross(b, cross(g0, t) @ back) - cross(l1, g1))
+    return Sampson(e / s, by_w / s[..., None], by_t / s[..., None])
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross product along the last axis; numpy's own takes five times as long on many rows."""
+    (a0, a1, a2), (b0, b1, b2) = (np.moveaxis(v, -1, 0) for v in (a, b))
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
 def _flat(lines: Floats) -> Floats:
     """Lines with their third component left out."""
-    out = lines.copy()
-    out[:, 2] = 0.0
-    return out
-
-
-def _turned(R: Floats, x: Floats) -> Floats:
-    """R x, row by row."""
-    return np.asarray((R @ x[:, :, None])[:, :, 0]) if R.ndim == 3 else x @ R.T
-
-
-def _turned_back(R: Floats, x: Floats) -> Floats:
-    """R^T x, row by row."""
-    return _turned(np.swapaxes(R, -1, -2), x)
+    return np.asarray(lines * np.array([1.0, 1.0, 0.0]))

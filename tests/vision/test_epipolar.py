@@ -71,9 +71,11 @@ def test_no_baseline_says_nothing(pair):
         assert not found.residual.any()
 
 
-def test_one_pose_for_all_or_one_each(pair):
+def test_many_pairs_at_once(pair):
     R, t, x0, x1 = pair
-    many = sampson(np.tile(R, (40, 1, 1)), np.tile(t, (40, 1)), x0, x1 + 0.01)
-    one = sampson(R, t, x0, x1 + 0.01)
-    for a, b in zip(many, one, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-14)
+    x1 = x1 + 0.01
+    poses = np.array([R, R @ R]), np.array([t, -2.0 * t + 0.1])
+    many = sampson(*poses, np.array([x0, x0]), np.array([x1, x1]))
+    for i, one in enumerate(zip(*poses, strict=True)):
+        for a, b in zip(many, sampson(*one, x0, x1), strict=True):
+            np.testing.assert_allclose(a[i], b, atol=1e-14)

@@ -1,0 +1,243 @@
+"""Row models of coplanarity: a pair of images as one row, all of its matches in it.
+
+Camera poses follow from those of the body at the two keyframes, R_i, p_i and R_j, p_j:
+
+    C = body_R_cam Exp(a),  D = R_i^T R_j,  m = R_i^T (p_j - p_i) + D l
+    c0_R_c1 = C^T D C,      c0_t_c1 = C^T (m - l),      l = body_t_cam
+
+with the boresight correction a as a state (A) where asked, and the clock offset d of the camera (T): the images show
+the poses d later, R Exp(w d) and p + v d.
+
+A match is one Sampson residual; its derivatives go by the six components of the relative pose. The normal equations of
+a pair in them have six rows at most, which say the same as all of its matches: A^T A = sum w J^T J. A seventh row
+without derivatives holds what they leave, so that the squares of a row sum up to the cost of its matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.factors.observation import exp, right_jacobian, skew, turned
+from smartnav_graph.losses import loss_weights
+from smartnav_graph.vision.epipolar import essential, rays, sampson
+from smartnav_graph.vision.pairs import Pairs
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Baselines (m) far below this say nothing: the speed of a hand that holds still, over a second.
+BASELINE_FLOOR_M = 1e-3
+# Parts of the normal equations smaller than this share of the largest are rounding.
+ROUNDING = 1e-12
+# Columns of a row's data: number of the pair, body rate (3) rad/s at both keyframes.
+COLUMNS = 7
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Camera in the body: body_R_cam (3, 3), body_t_cam (3,) m; boresight, timed : which states are estimated."""
+
+    body_R_cam: Floats
+    body_t_cam: Floats
+    boresight: bool = False
+    timed: bool = False
+
+    @property
+    def letters(self) -> tuple[str, ...]:
+        """Kinds of the states that a row touches."""
+        clock = ("V", "V", "T") if self.timed else ()
+        return ("X", "X", *clock, *(("A",) if self.boresight else ()))
+
+
+class Relative(NamedTuple):
+    """c0_R_c1 (m, 3, 3), c0_t_c1 (m, 3), and their derivatives (m, 6, n) [rotation, translation] by state."""
+
+    R: Floats
+    t: Floats
+    by: list[Floats]
+
+
+def relative(rig: Rig, states: Sequence[Floats], data: Floats) -> Relative:
+    """Relative camera pose of each row."""
+    first, second, *rest = states
+    speeds: list[Floats] = []
+    delay = np.zeros((len(data), 1))
+    if rig.timed:
+        *speeds, delay = rest[:3]
+        rest = rest[3:]
+    rate = data[:, 1:4], data[:, 4:7]
+    poses = (
+        [_later(pose, w, v, delay) for pose, w, v in zip((first, second), rate, speeds, strict=True)]
+        if speeds
+        else [
+            first,
+            second,
+        ]
+    )
+    found, by_first, by_second, by_boresight = _between(rig, poses[0], poses[1], rest[0] if rig.boresight else None)
+    by = [by_first, by_second]
+    if rig.timed:
+        moved = [_by_speed(j, pose) for j, pose in zip(by, poses, strict=True)]
+        turns = [_by_turn(j, w) for j, w in zip(by, rate, strict=True)]
+        by_clock = np.sum([turn + m @ v[:, :, None] for turn, m, v in zip(turns, moved, speeds, strict=True)], axis=0)
+        back = [exp(-w * delay) for w in rate]
+        by = [_before(j, turn) for j, turn in zip(by, back, strict=True)]
+        by += [m * delay[:, :, None] for m in moved] + [by_clock]
+    return Relative(found[0], found[1], [*by, *([by_boresight] if rig.boresight else [])])
+
+
+def _later(pose: Floats, rate: Floats, speed: Floats, delay: Floats) -> Floats:
+    """Poses (m, 4, 4) `delay` (m, 1) s later."""
+    moved = pose.copy()
+    moved[:, :3, :3] = pose[:, :3, :3] @ exp(rate * delay)
+    moved[:, :3, 3] += speed * delay
+    return moved
+
+
+def _by_speed(by_pose: Floats, pose: Floats) -> Floats:
+    """Derivative (m, 6, 3) by a displacement in nav axes."""
+    return by_pose[:, :, 3:] @ pose[:, :3, :3].transpose(0, 2, 1)
+
+
+def _by_turn(by_pose: Floats, rate: Floats) -> Floats:
+    """Derivative (m, 6, 1) by the time a turn goes on."""
+    return by_pose[:, :, :3] @ rate[:, :, None]
+
+
+def _before(by_pose: Floats, back: Floats) -> Floats:
+    """Derivative by the pose before it turned on: R Exp(u) Exp(w d) = R Exp(w d) Exp(back u), p + R u."""
+    return np.concatenate([by_pose[:, :, :3] @ back, by_pose[:, :, 3:] @ back], axis=2)
+
+
+def _between(
+    rig: Rig, first: Floats, second: Floats, boresight: Floats | None
+) -> tuple[tuple[Floats, Floats], Floats, Floats, Floats]:
+    """Relative camera pose and its derivatives by both body poses and by the boresight."""
+    C = np.broadcast_to(rig.body_R_cam, (len(first), 3, 3)) if boresight is None else rig.body_R_cam @ exp(boresight)
+    back, lever = C.transpose(0, 2, 1), rig.body_t_cam
+    Ri, Rj = first[:, :3, :3], second[:, :3, :3]
+    D = Ri.transpose(0, 2, 1) @ Rj
+    m = turned(Ri.transpose(0, 2, 1), second[:, :3, 3] - first[:, :3, 3]) + D @ lever
+    R, t = back @ D @ C, turned(back, m - lever)
+    by_first, by_second, by_a = (np.zeros((len(first), 6, n)) for n in (6, 6, 3))
+    by_first[:, :3, :3] = -(D @ C).transpose(0, 2, 1)
+    by_first[:, 3:, :3] = back @ skew(m)
+    by_first[:, 3:, 3:] = -back
+    by_second[:, :3, :3] = back
+    by_second[:, 3:, :3] = -back @ D @ skew(np.broadcast_to(lever, m.shape))
+    by_second[:, 3:, 3:] = back @ D
+    by_a[:, :3] = np.eye(3) - R.transpose(0, 2, 1)
+    by_a[:, 3:] = skew(t)
+    if boresight is not None:
+        by_a = by_a @ right_jacobian(boresight)
+    return (R, t), by_first, by_second, by_a
+
+
+class PairRows:
+    """Row model of pairs with every match under a loss of its own. Data: `COLUMNS`.
+
+    sigma : of a match, normalised coordinates; use (n, k) : padded mask of the matches in use, may change until the
+    row is added; reach : of the Cauchy loss, in sigmas
+    """
+
+    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float) -> None:
+        self.rig, self.sigma, self.use, self.reach = rig, sigma, use, reach
+        self.letters = rig.letters
+        self.x0, self.x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
+
+    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
+        """See `graph.RowModel`."""
+        rows = data[:, 0].astype(np.intp)
+        there = relative(self.rig, states, data)
+        found = sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M)
+        white = found.residual / self.sigma
+        weight, cost = loss_weights(white**2, "cauchy", self.reach)
+        weight, cost = weight * self.use[rows], cost * self.use[rows]
+        by = np.concatenate([found.by_rotation, found.by_translation], axis=-1) / self.sigma
+        weighted = (by * weight[..., None]).transpose(0, 2, 1)
+        root, residual = _condensed(weighted @ by, (weighted @ white[..., None])[..., 0], 2.0 * cost.sum(axis=1))
+        return residual, [root @ jacobian for jacobian in there.by]
+
+    def whitened(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, Floats, Mask]:
+        """Residuals (n, k) of the matches in sigmas, their weights, and which are in use."""
+        rows = data[:, 0].astype(np.intp)
+        there = relative(self.rig, states, data)
+        white = sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M).residual / self.sigma
+        return white, loss_weights(white**2, "cauchy", self.reach)[0], self.use[rows]
+
+
+def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, Floats]:
+    """Seven rows that stand for normal equations (m, 6, 6) with right side (m, 6) and a sum of squares (m,)."""
+    values, vectors = np.linalg.eigh(normal)
+    kept = values > ROUNDING * np.maximum(values[:, -1:], 1e-300)
+    scale = np.sqrt(np.where(kept, values, 0.0))
+    root = np.zeros((len(normal), 7, 6))
+    root[:, :6] = scale[:, :, None] * vectors.transpose(0, 2, 1)
+    residual = np.zeros((len(normal), 7))
+    seen = (vectors.transpose(0, 2, 1) @ right[:, :, None])[:, :, 0]
+    residual[:, :6] = np.where(kept, seen / np.where(kept, scale, 1.0), 0.0)
+    residual[:, 6] = np.sqrt(np.maximum(square - (residual**2).sum(axis=1), 0.0))
+    return root, residual
+
+
+class CompressedRows:
+    """Row model of pairs whose inliers are settled: what all matches say of the nine entries of E in nine rows.
+
+        W = sum k k^T / s_0^2 = L L^T,   k = x0~ kron x1~,   r = L^T vec(E) / (sigma sqrt(vec(E)^T N vec(E)))
+
+    s_0 of each match is frozen where it was compressed; the common length of E is not: N = sum N_i / sum s_0i^2 with
+    s_i^2 = vec(E)^T N_i vec(E). Exact but for the change of the weights relative to each other.
+    """
+
+    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, R: Floats, t: Floats) -> None:
+        self.rig, self.sigma = rig, sigma
+        self.letters = rig.letters
+        a, b = (rays(np.asarray(pairs.padded(x))) for x in (pairs.x0, pairs.x1))
+        E = essential(R, t)
+        l0, l1 = b @ E.transpose(0, 2, 1), a @ E
+        square = (l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + BASELINE_FLOOR_M**2
+        k = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:2], 9) * (use / np.sqrt(square))[..., None]
+        values, vectors = np.linalg.eigh(k.transpose(0, 2, 1) @ k)
+        self.root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
+        total = np.maximum((square * use).sum(axis=1), 1e-300)
+        self.length = _lengths(a, b, use) / total[:, None, None]
+        self.floor = BASELINE_FLOOR_M**2 * use.sum(axis=1) / total
+
+    def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
+        """See `graph.RowModel`."""
+        rows = data[:, 0].astype(np.intp)
+        there = relative(self.rig, states, data)
+        e, by_e = _vectorised(there.R, there.t)
+        N, root = self.length[rows], self.root[rows]
+        Ne = turned(N, e)
+        s = np.sqrt((e * Ne).sum(axis=1) + self.floor[rows])[:, None]
+        r = turned(root, e) / (self.sigma * s)
+        by = root / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
+        return r, [by @ by_e @ jacobian for jacobian in there.by]
+
+
+def _lengths(a: Floats, b: Floats, use: Mask) -> Floats:
+    """sum N_i (n, 9, 9), s_i^2 = vec(E)^T N_i vec(E): E b has the squares of its first two rows, E^T a likewise."""
+    bb = (b * use[..., None]).transpose(0, 2, 1) @ b
+    aa = (a * use[..., None]).transpose(0, 2, 1) @ a
+    flat = np.diag([1.0, 1.0, 0.0])
+    n = len(a)
+    first = np.einsum("ij,nkl->nikjl", flat, bb).reshape(n, 9, 9)
+    second = np.einsum("nij,kl->nikjl", aa, flat).reshape(n, 9, 9)
+    return np.asarray(first + second)
+
+
+def _vectorised(R: Floats, t: Floats) -> tuple[Floats, Floats]:
+    """vec(E) (m, 9), row by row, and its derivative (m, 9, 6) by rotation and translation."""
+    cross_t = skew(t)
+    by = np.empty((len(t), 3, 3, 6))
+    for i, axis in enumerate(np.eye(3)):
+        generator = skew(axis[None])[0]
+        by[:, :, :, i] = cross_t @ R @ generator
+        by[:, :, :, 3 + i] = generator @ R
+    return (cross_t @ R).reshape(-1, 9), by.reshape(-1, 9, 6)

@@ -1,0 +1,102 @@
+"""Which matches of a pair are to be believed, where the turn between the images is known: all pairs at once.
+
+With R known, each match gives the normal n = R x1~ x x0~ of its epipolar plane, and the baseline is at right angles to
+all of them: two matches give a hypothesis, and the one that most matches agree with is taken (MSAC). It is compared
+with the turn that was told, not with a fit of its own: a pair in which all points jump alike fits its own wrong motion.
+
+Source: Torr, Zisserman (2000), MLESAC, CVIU 78(1); Kneip, Chli, Siegwart (2011), Robust real-time visual odometry with
+a single camera and an IMU, BMVC.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.vision.epipolar import rays
+from smartnav_graph.vision.pairs import Pairs
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Residual in sigmas up to which a match agrees, and hypotheses tried: with 30 % outliers half of them are sound.
+AGREES = 3.0
+TRIED = 40
+
+
+@dataclass(frozen=True)
+class Gated:
+    """inliers (n, k) of the padded matches; direction (n, 3) of c0_t_c1, of either sign; parallax (n,) rad, median
+    after the turn is taken out"""
+
+    inliers: Mask
+    direction: Floats
+    parallax: Floats
+
+
+def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
+    """Matches that agree with the turn told and one baseline.
+
+    Parameters
+    ----------
+    R : (n, 3, 3) c0_R_c1 of each pair; sigma : (n,) of a good match in normalised coordinates, the turn's own
+    uncertainty included
+    """
+    a, b = (np.asarray(pairs.padded(rays(x))) for x in (pairs.x0, pairs.x1))
+    geometry = _Geometry(a, b @ R.transpose(0, 2, 1), R, pairs.there)
+    limit = (AGREES * sigma[:, None]) ** 2
+    rng = np.random.default_rng(seed)
+    best, cost = np.tile([0.0, 0.0, 1.0], (len(R), 1)), np.full(len(R), np.inf)
+    count = np.maximum(pairs.count, 1)
+    for _ in range(TRIED):
+        one, other = (geometry.normals_at((rng.random(len(R)) * count).astype(np.intp)) for _ in range(2))
+        best, cost = _better(geometry, np.cross(one, other), limit, best, cost)
+    for _ in range(2):
+        weight = (geometry.square(best) < limit) & pairs.there
+        best, cost = _better(geometry, geometry.fitted(weight / geometry.scale(best)), limit, best, cost)
+    return Gated((geometry.square(best) < limit) & pairs.there, best, geometry.parallax())
+
+
+def _better(geometry: _Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
+    """The better of two baselines (n, 3) of each pair, and its cost (n,)."""
+    size = np.linalg.norm(tried, axis=1, keepdims=True)
+    tried = np.where(size > 1e-12, tried / np.maximum(size, 1e-12), best)
+    new = np.where(geometry.there, np.minimum(geometry.square(tried), limit), 0.0).sum(axis=1)
+    take = new < cost
+    return np.where(take[:, None], tried, best), np.where(take, new, cost)
+
+
+class _Geometry:
+    """Rays a, y (n, k, 3) of both images in the axes of the first one."""
+
+    def __init__(self, a: Floats, y: Floats, R: Floats, there: Mask) -> None:
+        self.a, self.y, self.R, self.there = a, y, R, there
+        self.normals = np.cross(y, a)
+
+    def normals_at(self, place: NDArray[np.intp]) -> Floats:
+        """Normal (n, 3) of one match a pair."""
+        return np.asarray(self.normals[np.arange(len(place)), place])
+
+    def scale(self, t: Floats) -> Floats:
+        """s^2 (n, k) of `epipolar.sampson`."""
+        l0 = np.cross(t[:, None], self.y)
+        l1 = np.cross(self.a, t[:, None]) @ self.R
+        return np.asarray((l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + 1e-18)
+
+    def square(self, t: Floats) -> Floats:
+        """Squared Sampson residuals (n, k) of baselines t (n, 3)."""
+        e = (self.normals @ t[:, :, None])[..., 0]
+        return np.asarray(e**2 / self.scale(t))
+
+    def fitted(self, weight: Floats) -> Floats:
+        """Baselines (n, 3) that weighted matches (n, k) agree with best."""
+        moment = (self.normals * weight[..., None]).transpose(0, 2, 1) @ self.normals
+        return np.asarray(np.linalg.eigh(moment)[1][:, :, 0])
+
+    def parallax(self) -> Floats:
+        """Median angle (n,) between the rays of a match."""
+        apart = np.linalg.norm(self.normals, axis=-1)
+        angle = apart / np.maximum(np.linalg.norm(self.a, axis=-1) * np.linalg.norm(self.y, axis=-1), 1e-12)
+        return np.asarray(np.nan_to_num(np.nanmedian(np.where(self.there, angle, np.nan), axis=1)))

@@ -1,0 +1,181 @@
+"""Coplanarity of image pairs as rows of the graph: zero at the truth, exact derivatives, the sum of all matches."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, PairRows, Rig, relative
+from smartnav_graph.vision.epipolar import sampson
+from smartnav_graph.vision.pairs import Pairs
+
+SIGMA = 1.5e-3
+RIG = Rig(Rotation.from_euler("xyz", [-1.4, 0.1, 1.5]).as_matrix(), np.array([0.05, -0.1, 0.02]))
+
+
+def pose(rotvec, place):
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = Rotation.from_rotvec(rotvec).as_matrix(), place
+    return out
+
+
+def scene(rng, rig=RIG, noise=0.0, counts=(25, 40)):
+    """Two pairs of images of random points, their states and data."""
+    first = np.array([pose([0.1, 0.2, -0.3], [1, 2, 3]), pose([0.3, -0.2, 0.4], [-1, 0, 1])])
+    second = first @ np.array([pose([0.05, 0.1, -0.1], [0.3, 0.1, -0.05]), pose([-0.1, 0.02, 0.2], [-0.1, 0.4, 0.1])])
+    data = np.zeros((2, COLUMNS))
+    data[:, 0] = [0, 1]
+    data[:, 1:] = rng.normal(0, 0.5, (2, 6))
+    states = [first, second]
+    if rig.timed:
+        states += [rng.normal(0, 1, (2, 3)), rng.normal(0, 1, (2, 3)), np.full((2, 1), 0.02)]
+    if rig.boresight:
+        states += [np.tile([0.01, -0.02, 0.015], (2, 1))]
+    R, t, _ = relative(rig, states, data)
+    x0, x1, pair = [], [], []
+    for k, count in enumerate(counts):
+        far = rng.uniform([-2, -2, 3], [2, 2, 8], (count, 3))
+        near = (far - t[k]) @ R[k]
+        x0.append(far[:, :2] / far[:, 2:])
+        x1.append(near[:, :2] / near[:, 2:])
+        pair.append(np.full(count, k))
+    x0, x1 = (np.concatenate(x) + rng.normal(0, noise or 1e-300, (sum(counts), 2)) for x in (x0, x1))
+    stamps = np.arange(4, dtype=np.int64) * 10**9
+    return Pairs(stamps, np.array([[0, 1], [2, 3]]), x0, x1, np.concatenate(pair)), states, data
+
+
+def moved(letter, state, axis, h):
+    if letter != "X":
+        return state + h * np.eye(state.shape[1])[axis]
+    step = np.zeros(6)
+    step[axis] = h
+    return np.array([gtsam.Pose3(p).retract(step).matrix() for p in state])
+
+
+RIGS = [RIG, replace(RIG, boresight=True), replace(RIG, timed=True), replace(RIG, boresight=True, timed=True)]
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_relative_pose_has_exact_derivatives(rng, rig):
+    _, states, data = scene(rng, rig)
+    R, _, by = relative(rig, states, data)
+    h = 1e-6
+    for slot, letter in enumerate(rig.letters):
+        for axis in range(by[slot].shape[2]):
+            up, down = (
+                relative(rig, [moved(letter, s, axis, f * h) if i == slot else s for i, s in enumerate(states)], data)
+                for f in (1, -1)
+            )
+            turn = Rotation.from_matrix(down.R.transpose(0, 2, 1) @ up.R).as_rotvec() / (2 * h)
+            np.testing.assert_allclose(by[slot][:, :3, axis], turn, atol=1e-7)
+            np.testing.assert_allclose(by[slot][:, 3:, axis], (up.t - down.t) / (2 * h), atol=1e-7)
+    assert Rotation.from_matrix(R).magnitude().min() > 0.05
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_nothing_is_left_at_the_truth(rng, rig):
+    pairs, states, data = scene(rng, rig)
+    residual, jacobians = PairRows(pairs, rig, SIGMA, pairs.there, 2.0).linearize(states, data)
+    assert np.abs(residual).max() < 1e-9
+    assert all(jacobian[:, 6].any() == 0 for jacobian in jacobians)
+    there = relative(rig, states, data)
+    small = CompressedRows(pairs, rig, SIGMA, pairs.there, there.R, there.t)
+    assert np.abs(small.linearize(states, data)[0]).max() < 1e-3  # sigmas; the root of rounding
+
+
+def test_a_wrong_camera_is_seen(rng):
+    pairs, states, data = scene(rng)
+    for wrong in (
+        replace(RIG, body_R_cam=RIG.body_R_cam.T),
+        replace(RIG, body_t_cam=-5 * RIG.body_t_cam),
+    ):
+        assert np.abs(PairRows(pairs, wrong, SIGMA, pairs.there, 2.0).linearize(states, data)[0]).max() > 3.0
+    turned_about = [states[1], states[0]]
+    assert np.abs(PairRows(pairs, RIG, SIGMA, pairs.there, 2.0).linearize(turned_about, data)[0]).max() > 3.0
+
+
+def test_a_row_says_what_all_of_its_matches_say(rng):
+    """Cost and normal equations of a pair equal the sums over its matches, weighted by the loss."""
+    pairs, states, data = scene(rng, noise=2 * SIGMA)
+    use = pairs.there.copy()
+    use[:, ::5] = False
+    rows = PairRows(pairs, RIG, SIGMA, use, 2.0)
+    residual, jacobians = rows.linearize(states, data)
+    R, t, by = relative(RIG, states, data)
+    for k in range(2):
+        mask = use[k]
+        x0, x1 = (np.asarray(pairs.padded(x))[k][mask] for x in (pairs.x0, pairs.x1))
+        found = sampson(R[k], t[k], x0, x1, 1e-3)
+        white = found.residual / SIGMA
+        weight = 1 / (1 + white**2 / 4)
+        J = np.concatenate([found.by_rotation, found.by_translation], axis=1) / SIGMA @ by[0][k]
+        assert 0.5 * (residual[k] ** 2).sum() == pytest.approx(2 * np.log1p(white**2 / 4).sum(), rel=1e-9)
+        np.testing.assert_allclose(jacobians[0][k].T @ jacobians[0][k], (J.T * weight) @ J, rtol=1e-8, atol=1e-3)
+        np.testing.assert_allclose(jacobians[0][k].T @ residual[k], (J.T * weight) @ white, rtol=1e-6, atol=0.01)
+
+
+def test_compressed_pairs_have_the_same_minimum_and_curvature(rng):
+    pairs, states, data = scene(rng, noise=0.3 * SIGMA)
+    there = relative(RIG, states, data)
+    full = PairRows(pairs, RIG, SIGMA, pairs.there, 1e6)
+    small = CompressedRows(pairs, RIG, SIGMA, pairs.there, there.R, there.t)
+    a, A = full.linearize(states, data)
+    b, B = small.linearize(states, data)
+    np.testing.assert_allclose((b**2).sum(axis=1), (a**2).sum(axis=1), rtol=1e-6)
+    for k in range(2):
+        one, other = A[1][k].T @ A[1][k], B[1][k].T @ B[1][k]
+        assert np.abs(one - other).max() < 0.05 * np.abs(one).max()
+    step = 1e-3
+    for axis in range(6):
+        there_too = [states[0], moved("X", states[1], axis, step)]
+        cost = [(rows.linearize(there_too, data)[0] ** 2).sum(axis=1) for rows in (full, small)]
+        np.testing.assert_allclose(cost[1], cost[0], rtol=0.05, atol=0.5)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("kind", ["pairs", "compressed"])
+def test_rows_fall_with_their_derivatives(rng, rig, kind):
+    """The derivative of half the squares is J^T r, with outliers among the matches."""
+    pairs, states, data = scene(rng, rig, noise=SIGMA)
+    pairs.x1[::7] += 0.02
+    there = relative(rig, states, data)
+    rows = (
+        PairRows(pairs, rig, SIGMA, pairs.there, 2.0)
+        if kind == "pairs"
+        else CompressedRows(pairs, rig, SIGMA, pairs.there, there.R, there.t)
+    )
+    residual, jacobians = rows.linearize(states, data)
+    h = 1e-6
+    for slot, letter in enumerate(rig.letters):
+        for axis in range(jacobians[slot].shape[2]):
+            cost = [
+                0.5
+                * (
+                    rows.linearize(
+                        [moved(letter, s, axis, f * h) if i == slot else s for i, s in enumerate(states)], data
+                    )[0]
+                    ** 2
+                ).sum(axis=1)
+                for f in (1, -1)
+            ]
+            slope = np.einsum("md,md->m", jacobians[slot][:, :, axis], residual)
+            np.testing.assert_allclose(slope, np.subtract(*cost) / (2 * h), rtol=1e-4, atol=1e-2)
+
+
+def test_no_baseline_is_harmless(rng):
+    pairs, states, data = scene(rng)
+    still = [states[0], states[0]]
+    there = relative(RIG, still, data)
+    for rows in (
+        PairRows(pairs, RIG, SIGMA, pairs.there, 2.0),
+        CompressedRows(pairs, RIG, SIGMA, pairs.there, there.R, there.t),
+    ):
+        residual, jacobians = rows.linearize(still, data)
+        assert np.abs(residual).max() < 1e-9 and all(np.isfinite(jacobian).all() for jacobian in jacobians)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
