@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -45,6 +46,7 @@ from smartnav_graph.streams import (
 from smartnav_graph.timebase import NS, seconds_since
 
 SCHEMA = 1
+PICTURES = "images"  # the folder of the pictures in that of the session
 GPS_EPOCH_S = 315_964_800
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
@@ -83,6 +85,7 @@ class Session:
 
     Streams are optional; `origin` may be absent (metric local positions only). `gravity_m_s2` overrides normal
     gravity. `repairs` names the repairs applied when the session is loaded; `dropped` counts what they touched.
+    `pictures` is the folder that the files of the images count from; saving copies those that are there.
     """
 
     device: Device = Device()
@@ -94,6 +97,7 @@ class Session:
     repairs: tuple[str, ...] = ()
     dropped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     path: Path | None = None
+    pictures: Path | None = None
 
     imu: Imu | None = None
     gnss: GnssFix | None = None
@@ -236,7 +240,18 @@ def save(session: Session, path: str | Path, *, force: bool = False) -> None:
             write_table(stream.columns(), folder / f"{name}.parquet")
         if session.calibration is not None:
             (folder / "calibration.toml").write_text(calibration_model.dumps(session.calibration), encoding="utf-8")
+        _copy_pictures(session, folder / PICTURES)
         (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
+
+
+def _copy_pictures(session: Session, folder: Path) -> None:
+    if session.images is None or session.pictures is None:
+        return
+    for file in map(str, session.images.file):
+        source = session.pictures / file
+        if file and not Path(file).is_absolute() and source.is_file():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source, folder / file)
 
 
 def _header(session: Session) -> dict[str, Any]:
@@ -364,6 +379,6 @@ def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
             dropped |= {name: counts} if counts else {}
     header["repairs"] = wanted
     try:
-        return Session(path=folder, dropped=dropped, **header, **streams)  # type: ignore[arg-type]
+        return Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **header, **streams)  # type: ignore[arg-type]
     except SessionError as error:
         raise error.located(folder / f"{error.stream}.parquet" if error.stream else folder) from error

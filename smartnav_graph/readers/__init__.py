@@ -11,6 +11,7 @@ from pathlib import Path
 from smartnav_graph import session
 from smartnav_graph.errors import SessionError
 from smartnav_graph.readers import (
+    colmap,
     comma2k19,
     csv_folder,
     euroc,
@@ -18,6 +19,7 @@ from smartnav_graph.readers import (
     gtsam_euroc,
     gtsam_kitti,
     indoor_waypoints,
+    kitti_odometry,
     pyshoe,
     tyrex,
 )
@@ -36,6 +38,8 @@ READERS: dict[str, Reader] = {
         pyshoe.READER,
         tyrex.READER,
         indoor_waypoints.READER,
+        kitti_odometry.READER,
+        colmap.READER,
         csv_folder.READER,
     )
 }
@@ -103,7 +107,7 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
     if is_archive(Path(source)):
         with unpacked(Path(source)) as inside:
             source = _entry(inside)
-            return find(source, name).read(source, repairs=repairs)
+            return find(source, name).read(source, repairs=repairs).replace(pictures=None)  # they are gone with it
     return find(source, name).read(source, repairs=repairs)
 
 

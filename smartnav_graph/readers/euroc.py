@@ -1,7 +1,7 @@
 """EuRoC / ASL folders: ``imu0/data.csv``, ``cam*/data.csv`` with their ``sensor.yaml``, and the ground truth if there.
 
 Burri et al. (2016), The EuRoC micro aerial vehicle datasets. The body is the IMU: extrinsics T_BS of the cameras are
-taken relative to the IMU's own.
+taken relative to the IMU's own. Their interior orientation goes into the calibration, where sensor.yaml has it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.errors import CalibrationError, SessionError
 from smartnav_graph.readers.reference import euroc_columns
 from smartnav_graph.readers.source import Columns, Reader, build_session, mount, vector_columns
 from smartnav_graph.readers.text import read_bytes, read_text
@@ -23,6 +25,10 @@ NAME = "euroc"
 GRAVITY = 9.81
 GROUND_TRUTH = Path("state_groundtruth_estimate0", "data.csv")
 
+DEVICE = "EuRoC VI-Sensor ADIS16448"
+
+# Names of distortion in sensor.yaml -> those of `calibration.camera`.
+_MODELS = {"radial-tangential": "brown", "radtan": "brown", "equidistant": "fisheye"}
 _T_BS = re.compile(r"^T_BS:.*?data:\s*\[([^\]]*)\]", re.DOTALL | re.MULTILINE)
 
 
@@ -47,10 +53,12 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return build_session(
         tables,
         repairs,
-        device=Device(name="EuRoC VI-Sensor ADIS16448", forward="+z", up="+x"),
+        device=Device(name=DEVICE, forward="+z", up="+x"),
         clock_epoch="unix",
         gravity_m_s2=GRAVITY,
         sensors=_mounts(root, cameras),
+        calibration=_calibration(root, cameras),
+        pictures=root,
     )
 
 
@@ -84,6 +92,41 @@ def _mounts(root: Path, cameras: list[str]) -> Mapping[str, Mount]:
     imu_T_base = np.linalg.inv(_extrinsics(root / "imu0" / "sensor.yaml"))
     poses = {camera: imu_T_base @ _extrinsics(root / camera / "sensor.yaml") for camera in cameras}
     return {camera: mount(pose[:3, 3], pose[:3, :3]) for camera, pose in poses.items()}
+
+
+def _calibration(root: Path, names: list[str]) -> Calibration | None:
+    """The cameras that sensor.yaml knows; None where it knows none."""
+    found = {name: camera for name in names if (camera := _camera(root / name / "sensor.yaml")) is not None}
+    return Calibration(device=DEVICE, cameras=found) if found else None
+
+
+def _camera(path: Path) -> Camera | None:
+    """Interior orientation of a sensor.yaml; None where it has none."""
+    text = read_bytes(path).decode("utf-8", errors="replace")
+    if "intrinsics:" not in text:
+        return None
+    lists = {name: _numbers(path, text, name) for name in ("intrinsics", "resolution", "distortion_coefficients")}
+    named = re.search(r"^distortion_model:\s*(\S+)", text, re.MULTILINE)
+    model = _MODELS.get(named[1] if named else "")
+    try:
+        if model is None:
+            raise ValueError(f"distortion_model is {named[1] if named else 'missing'}")
+        width, height = map(int, lists["resolution"])
+        fx, fy, cx, cy = lists["intrinsics"]
+        return Camera(width, height, fx, fy, cx, cy, model, tuple(lists["distortion_coefficients"]))
+    except ValueError as error:
+        expected = f"resolution (2), intrinsics (4) and a distortion_model of {', '.join(_MODELS)}"
+        raise SessionError(path, f"describes no camera ({error})", expected) from error
+    except CalibrationError as error:
+        raise error.located(path) from error
+
+
+def _numbers(path: Path, text: str, name: str) -> list[float]:
+    found = re.search(rf"^{name}:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    try:
+        return [float(cell) for cell in found[1].split(",")] if found else []
+    except ValueError as error:
+        raise SessionError(path, f"{name} is no list of numbers ({error})", f"{name}: [1, 2, ...]") from error
 
 
 def _extrinsics(path: Path) -> NDArray[np.float64]:

@@ -197,6 +197,18 @@ def _moved(path: Path, columns: Columns, body_T_ref: Floats) -> Columns:
     return {"t_ns": columns["t_ns"]} | _columns_of(poses @ np.linalg.inv(body_T_ref))
 
 
+def pose_columns(path: Path, poses: Floats) -> Columns:
+    """File columns of the body's poses (n, 3, 4) or (n, 4, 4) in nav.
+
+    Raises
+    ------
+    SessionError
+        A row's 3x3 part is no rotation.
+    """
+    _check_rotations(path, poses)
+    return _columns_of(poses)
+
+
 def _columns_of(poses: Floats) -> Columns:
     quat = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
     return vector_columns("{}_m", poses[:, :3, 3], "enu") | dict(zip(QUATERNION, quat.T, strict=True))

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
+from smartnav_graph.errors import CalibrationError, SessionError
 from smartnav_graph.frames import axis_vector
 from smartnav_graph.readers.source import example_file
 from smartnav_graph.session import load, save
@@ -151,6 +151,42 @@ def test_asl_extrinsics_are_relative_to_the_imu(asl):
     # base_t_cam = (.1, .2, .3), and the IMU's x axis is the base's y axis
     np.testing.assert_allclose(mount.body_t, [0.2, -0.1, 0.3], atol=1e-15)
     np.testing.assert_allclose(np.array(mount.body_R)[:, 2], [0, -1, 0], atol=1e-15)  # looks along the base's x
+
+
+INTRINSICS = """resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 1.76e-05]
+"""
+
+
+def test_intrinsics_go_into_the_calibration(asl):
+    assert readers.read(asl).calibration is None
+    (asl / "mav0" / "cam1" / "sensor.yaml").write_text(T_BS + INTRINSICS)
+    session = readers.read(asl)
+    (name,) = session.calibration.cameras
+    camera = session.calibration.cameras[name]
+    assert (name, camera.width, camera.height, camera.model) == ("cam1", 752, 480, "brown")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (458.654, 457.296, 367.215, 248.375)
+    assert camera.distortion == (-0.28, 0.07, 0.0002, 1.76e-05)
+    assert session.pictures == asl / "mav0"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("radial-tangential", "spherical", "describes no camera (distortion_model is spherical)"),
+        ("458.654, ", "", "describes no camera (not enough values"),
+        ("-0.28", "x", "distortion_coefficients is no list of numbers"),
+        ("458.654", "-458.654", "focal lengths and noise > 0"),
+    ],
+)
+def test_broken_intrinsics_are_told(asl, old, new, part):
+    (asl / "mav0" / "cam0" / "sensor.yaml").write_text(T_BS + INTRINSICS.replace(old, new))
+    with pytest.raises((SessionError, CalibrationError), match=r"cam0/sensor\.yaml") as caught:
+        readers.read(asl)
+    assert part in str(caught.value)
 
 
 @pytest.mark.parametrize(
