@@ -1,0 +1,211 @@
+"""Pictures of a session: opened, and looked at before anything is measured in them.
+
+A picture is left out, with the reason, when its file is missing or broken, its camera is not calibrated or calibrated
+at another size, when it is dark, blurred beyond the rest of the recording, or the same as the one before it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.errors import SessionError
+from smartnav_graph.session import Session
+from smartnav_graph.timebase import NS
+
+Gray = NDArray[np.uint8]
+
+MISSING = "missing file"
+BROKEN = "broken file"
+UNCALIBRATED = "camera without calibration"
+RESIZED = "other size than calibrated"
+DARK = "dark or without contrast"
+BLURRED = "blurred"
+REPEATED = "repeated"
+REASONS = (MISSING, BROKEN, UNCALIBRATED, RESIZED, DARK, BLURRED, REPEATED)
+
+# Grey levels between the darkest and the brightest hundredth: less is noise, a covered lens or night.
+LEAST_CONTRAST = 16.0
+# A picture half as sharp as is usual is smeared by about a thirtieth of its width.
+LEAST_SHARPNESS = 0.5
+USUAL_OF, USUAL_FROM = 200, 5  # pictures
+_SMALL_PX = 400
+
+# A marker in the compressed part of a JPEG: neither a stuffed byte, nor a restart, nor filling.
+_MARKER = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
+_WITHOUT_LENGTH = (0x01, 0xD8)
+_SCAN, _END = 0xDA, 0xD9
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One row of the images: where its file should be."""
+
+    image_id: int
+    t_ns: int
+    camera: str
+    file: str
+    path: Path
+
+    def fingerprint(self) -> bytes:
+        """Hash of the file's bytes; empty where there is none."""
+        try:
+            return hashlib.blake2b(self.path.read_bytes(), digest_size=16).digest()
+        except OSError:
+            return b""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A picture opened: `gray` (h, w) where nothing is wrong with it by itself, else the `fault`."""
+
+    gray: Gray | None
+    fault: str = ""
+    sharpness: float = 0.0
+    fingerprint: bytes = b""
+
+
+def pictures(session: Session) -> list[Picture]:
+    """The pictures of a session, by time.
+
+    Raises
+    ------
+    SessionError
+        There are none: no images, or only rows without a file.
+    """
+    images, folder = session.images, session.pictures
+    where = session.path or "session"
+    if images is None:
+        raise SessionError(where, "has no images", "images.parquet with pictures", "import a log with a camera")
+    if folder is None or not any(images.file):
+        found = "lists images, but no files of them"
+        raise SessionError(where, found, "files in images/", "its tracks or matches can be used as they are")
+    rows = zip(images.image_id, images.t_ns, images.camera, images.file, strict=True)
+    return [Picture(int(i), int(t), str(camera), str(file), folder / str(file)) for i, t, camera, file in rows]
+
+
+def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
+    """At most `rate_hz` pictures a second of each camera: the first of each interval; all where the rate is 0."""
+    if rate_hz <= 0:
+        return found
+    seen: set[tuple[str, int]] = set()
+    kept = []
+    for picture in found:
+        interval = (picture.camera, int((picture.t_ns - found[0].t_ns) / NS * rate_hz + 0.01))
+        if interval not in seen:
+            seen.add(interval)
+            kept.append(picture)
+    return kept
+
+
+def look(picture: Picture, camera: Camera | None) -> Look:
+    """Open a picture and see what is wrong with it by itself."""
+    if camera is None:
+        return Look(None, UNCALIBRATED)
+    try:
+        data = picture.path.read_bytes()
+    except OSError:
+        return Look(None, MISSING)
+    gray = decoded(data)
+    if gray is None:
+        return Look(None, BROKEN)
+    if gray.shape != (camera.height, camera.width):
+        return Look(None, RESIZED)
+    low, high = np.percentile(gray[::4, ::4], [1.0, 99.0])
+    if high - low < LEAST_CONTRAST:
+        return Look(None, DARK)
+    return Look(gray, "", sharpness(gray), hashlib.blake2b(gray.tobytes(), digest_size=16).digest())
+
+
+def decoded(data: bytes) -> Gray | None:
+    """Grey levels (h, w) of the bytes of a picture; None where it is cut short or no picture.
+
+    OpenCV fills the lost part of a truncated file with grey, so that the end of the file is looked for first.
+    """
+    if not _is_whole(data):
+        return None
+    import cv2
+
+    try:
+        found: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        return None
+    return None if found is None else np.asarray(found, dtype=np.uint8)
+
+
+def _is_whole(data: bytes) -> bool:
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-64:]
+    return _jpeg_ends(data) if data.startswith(b"\xff\xd8") else bool(data)
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether the markers of a JPEG lead to its end; what cameras append behind it is nobody's business."""
+    at = 2
+    while marker := _MARKER.search(data, at):
+        kind = marker[1][0]
+        if kind == _END:
+            return True
+        at = marker.end()
+        if kind not in _WITHOUT_LENGTH:
+            at += int.from_bytes(data[at : at + 2], "big")
+    return False
+
+
+def sharpness(gray: Gray) -> float:
+    """Gradient across the direction in which the picture is smeared most, over its contrast, at a common width.
+
+    The root of the smaller eigenvalue of the mean structure tensor over the standard deviation; 0.12 to 0.18 for sharp
+    pictures of rooms, roads and buildings, whatever their noise. Source: Bigün, Granlund (1987), Optimal orientation
+    detection of linear symmetry, ICCV.
+    """
+    import cv2
+
+    scale = min(_SMALL_PX / max(gray.shape), 1.0)
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.0)
+    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=3) / 8.0 for axes in ((1, 0), (0, 1)))
+    a, b, c = (x * x).mean(), (x * y).mean(), (y * y).mean()
+    least = max((a + c) / 2.0 - np.hypot((a - c) / 2.0, b), 0.0)
+    return float(np.sqrt(least / max(smooth.var(), 1.0)))
+
+
+@dataclass
+class Judge:
+    """Compares each picture with those of the same camera before it; one for all cameras, pictures in order."""
+
+    _usual: dict[str, deque[float]] = field(default_factory=dict)
+    _last: dict[str, bytes] = field(default_factory=dict)
+
+    def fault(self, picture: Picture, seen: Look) -> str:
+        """What is wrong with the picture; empty for a good one."""
+        if seen.gray is None:
+            return seen.fault
+        usual = self._usual.setdefault(picture.camera, deque(maxlen=USUAL_OF))
+        blurred = len(usual) >= USUAL_FROM and seen.sharpness < LEAST_SHARPNESS * float(np.median(usual))
+        usual.append(seen.sharpness)
+        repeated = self._last.get(picture.camera) == seen.fingerprint
+        self._last[picture.camera] = seen.fingerprint
+        return REPEATED if repeated else BLURRED if blurred else ""
+
+
+def longest_break_s(found: Iterable[Picture], used: Iterable[Picture]) -> float:
+    """Longest time, s, between used pictures of one camera, the recording's ends included."""
+    usable = {(picture.camera, picture.t_ns) for picture in used}
+    stamps: dict[str, list[int]] = {}
+    ends: dict[str, list[int]] = {}
+    for picture in found:
+        ends.setdefault(picture.camera, []).append(picture.t_ns)
+        if (picture.camera, picture.t_ns) in usable:
+            stamps.setdefault(picture.camera, []).append(picture.t_ns)
+    breaks = [np.diff([all_[0], *stamps.get(camera, []), all_[-1]]).max() for camera, all_ in ends.items()]
+    return float(max(breaks, default=0)) / NS
