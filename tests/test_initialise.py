@@ -29,7 +29,8 @@ from smartnav_graph.initialise import (
 from smartnav_graph.keyframes import KeyframeConfig, make_windows
 from smartnav_graph.problem import prepare
 from smartnav_graph.simulation import motions, sensors
-from smartnav_graph.simulation.scenarios import magnetic_field_ut, simulate
+from smartnav_graph.simulation.recording import magnetic_field_ut
+from smartnav_graph.simulation.scenarios import simulate
 from smartnav_graph.simulation.sensors import PROFILES
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 from smartnav_graph.streams import Imu, Magnetometer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from smartnav_graph.simulation.trajectory import Eight, Leg, Legs, Sway, Trajectory
@@ -84,6 +86,64 @@ def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajector
         legs += [*half, Leg(4.0, 1.0, 90.0), Leg(side / 2, 1.0), Leg(2.0, 0.0), Leg(stop, 0.0)]
     sway = (Sway(hertz=6.0, shift=(0.0, 0.0, 2e-4), tilt=(0.0, 0.001, 0.0)),)
     return Trajectory(Legs(legs, heading_deg=25.0), sway=sway)
+
+
+# A trolley pushed over a floor: castors and joints, the rocking load, the hand that steers, the steps of who pushes.
+_CASTORS = (
+    Sway(hertz=6.0, shift=(0.0, 0.0, 2e-4), tilt=(0.0, 1e-3, 0.0)),
+    Sway(hertz=1.1, tilt=(0.0, 0.002, 0.003), phase=0.4),
+    Sway(hertz=0.23, tilt=(0.02, 0.0, 0.0), phase=1.3),
+    Sway(hertz=1.8, shift=(0.0, 0.008, 0.0), phase=2.1),
+)
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """A trolley pushed counter-clockwise round a rectangle of corridors, from a rest in the middle of its east side.
+
+    It starts at the origin facing north, which is what a start from a rest takes for granted where nothing else is
+    told. `straights_s` are the times between two corners along the sides north-south and east-west. After every three
+    corners it stops in the middle of a side.
+    """
+
+    straights_s: tuple[float, float] = (34.0, 18.0)
+    rest_s: float = 180.0
+    stops: int = 10
+    stop_s: float = 10.0
+    speed_m_s: float = 1.0
+    corner_s: float = 4.0
+    ramp_s: float = 2.0
+    sway: tuple[Sway, ...] = _CASTORS
+
+    def __call__(self, seconds: float, rng: np.random.Generator) -> Trajectory:
+        """The motion; it takes as long as it takes."""
+        legs = [Leg(self.rest_s, 0.0)]
+        for stop in range(self.stops):
+            legs += self._drive(stop)
+        return Trajectory(Legs(legs), sway=self.sway, sway_speed=self.speed_m_s)
+
+    def _drive(self, stop: int) -> list[Leg]:
+        """Half a side, three corners with the sides between them, half a side, and the stop."""
+        here, other = (self.straights_s[(stop + k) % 2] for k in range(2))
+        ramp, v = self.ramp_s, self.speed_m_s
+        corner = Leg(self.corner_s, v, 90.0)
+        first = [Leg(ramp, v), Leg(here / 2 - ramp / 2, v)]
+        last = [Leg(other / 2 - ramp / 2, v), Leg(ramp, 0.0), Leg(self.stop_s, 0.0)]
+        return [*first, corner, Leg(other, v), corner, Leg(here, v), corner, *last]
+
+
+def in_a_room(duration: float, rng: np.random.Generator) -> Trajectory:
+    """A phone in the hand, carried round a loop of 2.9 m by 2.9 m at 0.5 m/s after 3 s of rest, raised and lowered by
+    15 cm and turned about all axes; it starts at the origin facing north."""
+    legs = [Leg(3.0, 0.0), Leg(2.0, 0.5)]
+    while sum(leg.seconds for leg in legs) < duration:
+        legs.append(Leg(5.0, 0.5, 90.0))
+    sway = (
+        Sway(hertz=0.31, shift=(0.03, 0.0, 0.15), tilt=(0.06, 0.10, 0.08)),
+        Sway(hertz=0.83, shift=(0.02, 0.01, 0.03), tilt=(0.02, 0.03, 0.04), phase=0.5),
+        Sway(hertz=2.1, shift=(0.003, 0.003, 0.006), tilt=(0.004, 0.004, 0.006), phase=1.9),
+    )
+    return Trajectory(Legs(legs), held_deg=(0.0, 5.0, 2.0), sway=sway, sway_speed=0.5)
 
 
 def figure_eight(duration: float, *, rest: float = 5.0) -> Trajectory:

@@ -1,0 +1,249 @@
+"""A scenario -> a recorded session with its truth: the same type a reader gives, `reference` holding the exact states.
+
+The truth stands at 10 Hz and at every epoch of a fix or an image, on exact inertial stamps. All recordings: 100 Hz
+inertial samples, flat ENU frame at 52 N, 11 E, 100 m, gravity constant and straight down, no Earth rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph import frames
+from smartnav_graph.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
+from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.simulation import cameras, fixes, sensors
+from smartnav_graph.simulation.cameras import CameraModel
+from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
+from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
+from smartnav_graph.simulation.trajectory import Trajectory, Truth
+from smartnav_graph.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
+from smartnav_graph.timebase import NS, ns_from_seconds
+
+ORIGIN = Origin(52.0, 11.0, 100.0)
+START_NS = 1_748_772_000 * NS  # 2025-06-01 10:00 UTC
+YEAR = 2025.41
+RATE_HZ = 100
+SLOW_ROWS = 10  # reference: every tenth inertial sample
+_OWN_EPOCHS = ("gnss", "control", "pose_fixes", "images")
+CONTROL_SIGMA_M = 0.02
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A motion of `seconds` (the first samples of it), a device and its sensors; call it with a seed.
+
+    rest_sigma_m_s : what the listed standstills say of the speed left
+    """
+
+    name: str
+    seconds: float
+    motion: Callable[[float, np.random.Generator], Trajectory]
+    vehicle: str = "none"
+    profile: str = "mems"
+    gnss: GnssModel | None = None
+    control: bool = False
+    magnetometer: MagnetometerModel | None = None
+    barometer: BarometerModel | None = None
+    wheel: SpeedModel | None = None
+    velocity: SpeedModel | None = None
+    pose_fixes: PoseFixModel | None = None
+    camera: CameraModel | None = None
+    rest_sigma_m_s: float = 0.01
+
+    def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
+        return _record(self, seed, calibrated)
+
+
+# Every purpose has random numbers of its own: a new sensor is added at the end and leaves the others as they were.
+PURPOSES = (
+    *("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes"),
+    *("scene", "camera"),
+)
+
+
+@dataclass(frozen=True)
+class _Ride:
+    """One motion sampled at the inertial stamps, and the random numbers of every purpose."""
+
+    trajectory: Trajectory
+    t: NDArray[np.float64]
+    truth: Truth
+    seed: int
+    frame: LocalFrame
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        return START_NS + ns_from_seconds(self.t)
+
+    def rng(self, purpose: str) -> np.random.Generator:
+        return np.random.default_rng((self.seed, PURPOSES.index(purpose)))
+
+    def rows(self, rate_hz: float) -> slice:
+        """Every so many inertial samples."""
+        return slice(None, None, round(RATE_HZ / rate_hz))
+
+
+def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
+    trajectory = scenario.motion(scenario.seconds, np.random.default_rng((seed, 0)))
+    t = np.arange(round(scenario.seconds * RATE_HZ)) / RATE_HZ
+    ride = _Ride(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
+    profile = PROFILES[scenario.profile]
+    imu, biases = sensors.imu(ride.truth, ride.t_ns, profile.noise, _gravity(), ride.rng("imu"))
+    streams: dict[str, Stream | None] = {
+        "gnss": _gnss(ride, scenario.gnss),
+        "control": _control(ride) if scenario.control else None,
+        "pose_fixes": _pose_fixes(ride, scenario.pose_fixes),
+        **_slow_sensors(ride, scenario),
+        **_camera(ride, scenario.camera),
+    }
+    rows = [np.arange(0, len(t), SLOW_ROWS)]
+    rows += [np.searchsorted(ride.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
+    mounts = {} if scenario.gnss is None else {"gnss": Mount(body_t=scenario.gnss.body_t_antenna)}
+    if scenario.camera is not None:
+        mounts[scenario.camera.name] = scenario.camera.mount
+    return Session(
+        device=Device(name=f"simulated {profile.name}", vehicle=scenario.vehicle),
+        clock_epoch="unix",
+        origin=ORIGIN,
+        sensors=mounts,
+        calibration=_calibration(scenario) if calibrated else None,
+        imu=imu,
+        static=_static(trajectory, ride.t_ns, scenario.rest_sigma_m_s),
+        reference=reference(ride.truth, ride.t_ns, biases, np.unique(np.concatenate(rows))),
+        **streams,  # type: ignore[arg-type]
+    )
+
+
+def _gnss(ride: _Ride, model: GnssModel | None) -> GnssFix | None:
+    if model is None:
+        return None
+    every = ride.rows(model.rate_hz)
+    truth, t_ns = ride.truth.take(every), ride.t_ns[every]
+    if model.offset_s:
+        spoken = ride.t[every] + model.offset_s
+        inside = (spoken >= 0.0) & (spoken <= ride.trajectory.duration)
+        truth, t_ns = ride.trajectory.sample(spoken[inside]), t_ns[inside]
+    return fixes.gnss(truth, t_ns, model, ride.frame, ride.rng("gnss"))
+
+
+def _control(ride: _Ride) -> ControlPoint:
+    at = _stop_rows(ride.trajectory, ride.t)
+    names = [f"P{i}" for i in range(len(at))]
+    rng = ride.rng("control")
+    return fixes.control(ride.truth.take(at), ride.t_ns[at], names, CONTROL_SIGMA_M, ride.frame, rng)
+
+
+def _pose_fixes(ride: _Ride, model: PoseFixModel | None) -> PoseFix | None:
+    if model is None:
+        return None
+    at = np.searchsorted(ride.t, np.arange(model.first_s, ride.t[-1], model.every_s) - 1e-9)
+    return fixes.pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
+
+
+def _camera(ride: _Ride, model: CameraModel | None) -> dict[str, Stream | None]:
+    if model is None:
+        return {}
+    scene, every = model.scene(ride.rng("scene")), ride.rows(model.rate_hz)
+    t_ns, t = ride.t_ns[every], ride.t[every]
+    taken = cameras.take(model, ride.trajectory, t_ns, t, scene, ride.rng("camera"))
+    return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
+
+
+def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:
+    """The streams that make no keyframes."""
+    made: dict[str, Stream] = {}
+    if (mag := scenario.magnetometer) is not None:
+        rows, rng = ride.rows(mag.rate_hz), ride.rng("magnetometer")
+        made["magnetometer"] = sensors.magnetometer(
+            ride.truth.take(rows),
+            ride.t_ns[rows],
+            magnetic_field_ut(),
+            rng,
+            hard_iron_sigma_ut=mag.hard_iron_sigma_ut,
+            sigma_ut=mag.sigma_ut,
+            disturbances=mag.disturbances,
+        )
+    if (baro := scenario.barometer) is not None:
+        rows, rng = ride.rows(baro.rate_hz), ride.rng("barometer")
+        made["barometer"] = sensors.barometer(
+            ORIGIN.height_m + ride.truth.nav_t_body[rows, 2],
+            ride.t_ns[rows],
+            rng,
+            offset_sigma_hpa=baro.offset_sigma_hpa,
+            sigma_hpa=baro.sigma_hpa,
+            walk_hpa=baro.walk_hpa,
+        )
+    if (model := scenario.wheel) is not None:
+        rows, rng = ride.rows(model.rate_hz), ride.rng("wheel")
+        made["wheel"] = sensors.wheel(ride.trajectory.speed(ride.t[rows]), ride.t_ns[rows], model, rng)
+    if (model := scenario.velocity) is not None:
+        rows, rng = ride.rows(model.rate_hz), ride.rng("velocity")
+        made["velocity"] = sensors.velocity(ride.truth.take(rows), ride.t_ns[rows], model, rng)
+    return made
+
+
+def _gravity() -> float:
+    return frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m)
+
+
+def _calibration(scenario: Scenario) -> Calibration:
+    profile, model = PROFILES[scenario.profile], scenario.gnss or GnssModel()
+    gnss = GnssNoise(
+        horizontal_sigma=model.white_m,
+        vertical_sigma=1.5 * model.white_m,
+        correlated_horizontal_sigma=model.markov_m,
+        correlated_vertical_sigma=1.5 * model.markov_m,
+        correlated_time=model.markov_s,
+    )
+    made = Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
+    if (mag := scenario.magnetometer) is not None:  # what stays alike for seconds is simulated as passing iron only
+        iron = MagnetometerNoise(sigma_ut=mag.sigma_ut, disturbance_ut=0.0, hard_iron_sigma_ut=mag.hard_iron_sigma_ut)
+        made = replace(made, magnetometer_noise=iron)
+    if (baro := scenario.barometer) is not None and baro.walk_hpa > 0:
+        made = replace(made, barometer_noise=BarometerNoise(baro.sigma_hpa, baro.walk_hpa))
+    if (camera := scenario.camera) is not None:
+        made = replace(made, cameras={camera.name: camera.camera})
+    return made
+
+
+def magnetic_field_ut() -> NDArray[np.float64]:
+    """World Magnetic Model at the scenarios' origin and date, (3,) uT in ENU."""
+    return frames.magnetic_field_ut(ORIGIN, YEAR)
+
+
+def _within(trajectory: Trajectory, end: float) -> list[tuple[float, float]]:
+    return [(start, min(stop, end)) for start, stop in trajectory.rests if start < end]
+
+
+def _static(trajectory: Trajectory, t_ns: NDArray[np.int64], sigma_m_s: float) -> StaticPeriod | None:
+    """The standstills, from the first to the last inertial sample taken at rest."""
+    rests = _within(trajectory, float(t_ns[-1] - t_ns[0]) / NS)
+    if not rests:
+        return None
+    start, end = (t_ns[0] + ns_from_seconds([rest[i] for rest in rests]) for i in range(2))
+    first, last = np.searchsorted(t_ns, start), np.searchsorted(t_ns, end, side="right") - 1
+    source = np.full(len(rests), "simulation", dtype=object)
+    return StaticPeriod(t_ns=t_ns[first], t_end_ns=t_ns[last], sigma_v=np.full(len(rests), sigma_m_s), source=source)
+
+
+def _stop_rows(trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The inertial sample in the middle of every standstill."""
+    return np.searchsorted(t, [(start + end) / 2 for start, end in _within(trajectory, float(t[-1]))])
+
+
+def reference(truth: Truth, t_ns: NDArray[np.int64], biases: Biases, rows: NDArray[np.intp]) -> Reference:
+    """The exact states at these rows."""
+    return Reference(
+        t_ns=t_ns[rows],
+        enu=truth.nav_t_body[rows],
+        quat=Rotation.from_matrix(truth.nav_R_body[rows]).as_quat(canonical=True)[:, [3, 0, 1, 2]],
+        velocity=truth.nav_v_body[rows],
+        accel_bias=biases.accel[rows],
+        gyro_bias=biases.gyro[rows],
+    )

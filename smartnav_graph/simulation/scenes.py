@@ -1,0 +1,156 @@
+"""Rooms and corridors made of rectangles, the points scattered on them, and what a camera can see of both.
+
+A face is a rectangle corner + a u + b v, 0 <= a, b <= 1, seen from the side its normal u x v points to. Faces hide what
+lies behind them, so that nobody looks through a wall. All positions are nav metres (ENU).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+# Share of the way to a point within which another face hides it; the point itself lies on a face.
+_BEFORE = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Box:
+    """An upright cuboid from corner `low` to corner `high` (east, north, up m); `inward`: seen from inside (a room)."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    inward: bool = False
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ConfigError("scene", f"box from {self.low} to {self.high}", "every side longer than zero")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,)."""
+
+    corner: Floats
+    u: Floats
+    v: Floats
+    points: Floats
+    face: Rows
+
+    @cached_property
+    def normal(self) -> Floats:
+        """Unit normals (f, 3) of the faces, towards those who see them."""
+        normal = np.cross(self.u, self.v)
+        return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+    def seen_from(self, centre: Floats, rows: Rows) -> Rows:
+        """Those of the points `rows` that no face hides from a camera at `centre` (3,), and that face it."""
+        ahead = np.einsum("ni,ni->n", centre - self.points[rows], self.normal[self.face[rows]]) > 0.0
+        rows = rows[ahead]
+        return rows[~self._hidden(centre, rows)]
+
+    def _hidden(self, centre: Floats, rows: Rows) -> NDArray[np.bool_]:
+        """Mask of the points with another face on the way to them; what is closed hides by a face seen from here."""
+        hidden, way = np.zeros(len(rows), dtype=bool), self.points[rows] - centre
+        height = np.einsum("fi,fi->f", centre - self.corner, self.normal)
+        for f in np.flatnonzero(height > 0.0):
+            down = -way @ self.normal[f]
+            share = height[f] / np.where(down > 0.0, down, np.inf)
+            at = share[:, None] * way + (centre - self.corner[f])
+            a, b = (at @ (edge / (edge @ edge)) for edge in (self.u[f], self.v[f]))
+            hidden |= (share < _BEFORE) & (down > 0.0) & (a >= 0.0) & (a <= 1.0) & (b >= 0.0) & (b <= 1.0)
+        return hidden
+
+
+def build(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
+    """The faces of the boxes, with `per_m2` points a square metre scattered evenly on them."""
+    faces = np.concatenate([_faces(box) for box in boxes])
+    corner, u, v = faces[:, 0], faces[:, 1], faces[:, 2]
+    area = np.linalg.norm(np.cross(u, v), axis=1)
+    face = np.repeat(np.arange(len(area)), rng.poisson(per_m2 * area))
+    a, b = rng.random((2, len(face), 1))
+    return Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face)
+
+
+def _faces(box: Box) -> Floats:
+    """Corner, u and v (6, 3, 3) of the faces of a box."""
+    low, high = np.array(box.low), np.array(box.high)
+    edges = np.diag(high - low)
+    faces = []
+    for axis in range(3):
+        u, v = edges[(axis + 1) % 3], edges[(axis + 2) % 3]
+        for corner, outward in ((low, -1.0), (low + edges[axis], 1.0)):
+            faces.append((corner, u, v) if (outward > 0) != box.inward else (corner, v, u))
+    return np.array(faces)
+
+
+@dataclass(frozen=True)
+class FurnishedRoom:
+    """A room of `size_m` (east, north, up) about `centre_m`, with five pieces of furniture along its walls and `per_m2`
+    points a square metre."""
+
+    size_m: tuple[float, float, float] = (8.0, 6.0, 3.0)
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    per_m2: float = 6.0
+
+    def __call__(self, rng: np.random.Generator) -> Scene:
+        half = np.array(self.size_m) / 2
+        low, high = np.array(self.centre_m) - half, np.array(self.centre_m) + half
+        boxes = [Box(_triple(low), _triple(high), inward=True)]
+        for k in range(5):
+            size = rng.uniform(0.6, 1.4), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.8)
+            boxes.append(_along_wall(low, high, k % 4, rng.uniform(0.15, 0.75), size))
+        return build(boxes, self.per_m2, rng)
+
+
+@dataclass(frozen=True)
+class RingCorridor:
+    """A corridor of `width_m` round a block of rooms, and a hall where the block is shorter by `hall_m` in the east.
+
+    Its middle line is the rectangle from `south_west_m` to `north_east_m`; floor and ceiling are at `floor_m` and
+    `ceiling_m`. Twelve cupboards stand along the outer walls, flat enough to pass. `per_m2` points a square metre.
+    """
+
+    south_west_m: tuple[float, float]
+    north_east_m: tuple[float, float]
+    width_m: float = 3.0
+    hall_m: float = 0.0
+    floor_m: float = -1.0
+    ceiling_m: float = 2.0
+    per_m2: float = 8.0
+
+    def __call__(self, rng: np.random.Generator) -> Scene:
+        (west, south), (east, north), half = self.south_west_m, self.north_east_m, self.width_m / 2
+        low = np.array([west - half, south - half, self.floor_m])
+        high = np.array([east + half, north + half, self.ceiling_m])
+        block = Box((west + half, south + half, low[2]), (east - half - self.hall_m, north - half, high[2]))
+        boxes = [Box(_triple(low), _triple(high), inward=True), block]
+        for k in range(12):
+            size = rng.uniform(0.8, 2.0), 0.35, rng.uniform(0.8, 2.0)
+            boxes.append(_along_wall(low, high, k % 4, (k // 4 + rng.uniform(0.1, 0.9)) / 3, size))
+        return build(boxes, self.per_m2, rng)
+
+
+def _along_wall(low: Floats, high: Floats, side: int, share: float, size: tuple[float, float, float]) -> Box:
+    """A piece of furniture of `size` (wide, deep, tall) that begins at `share` of a wall (south, east, north, west)."""
+    wide, deep, tall = size
+    along, across = (0, 1) if side in (0, 2) else (1, 0)
+    a, b = low.copy(), high.copy()
+    a[along] = low[along] + share * (high[along] - low[along] - wide)
+    b[along] = a[along] + wide
+    a[across], b[across] = (low[across], low[across] + deep) if side in (0, 3) else (high[across] - deep, high[across])
+    b[2] = low[2] + tall
+    return Box(_triple(a), _triple(b))
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
