@@ -27,11 +27,14 @@ CELLS = 16
 
 @dataclass(frozen=True)
 class Kind:
-    """How to make a detector (of the cv2 module and the number of points) and a descriptor; None: the same object."""
+    """How to make a detector (of the cv2 module and the number of points) and a descriptor; None: the same object.
+
+    at_once : detector and descriptor share a pyramid, and the detector keeps to the number of points
+    """
 
     detector: Callable[[Any, int], Any]
     descriptor: Callable[[Any], Any] | None = None
-    binary: bool = True
+    at_once: bool = False
 
 
 def _freak(cv2: Any) -> Any:
@@ -40,8 +43,8 @@ def _freak(cv2: Any) -> Any:
 
 # Thresholds are low: the strongest points are taken, however weak the texture is.
 KINDS: dict[str, Kind] = {
-    "orb": Kind(lambda cv2, n: cv2.ORB_create(nfeatures=n, fastThreshold=10)),
-    "sift": Kind(lambda cv2, n: cv2.SIFT_create(nfeatures=n, contrastThreshold=0.02), binary=False),
+    "orb": Kind(lambda cv2, n: cv2.ORB_create(nfeatures=n, fastThreshold=10), at_once=True),
+    "sift": Kind(lambda cv2, n: cv2.SIFT_create(nfeatures=n, contrastThreshold=0.02), at_once=True),
     "akaze": Kind(lambda cv2, n: cv2.AKAZE_create(threshold=5e-4)),
     "brisk": Kind(lambda cv2, n: cv2.BRISK_create(thresh=20)),
     "fast+freak": Kind(lambda cv2, n: cv2.FastFeatureDetector_create(15), _freak),
@@ -120,17 +123,28 @@ def extract(gray: Gray, camera: Camera, name: str, count: int) -> Features:
     camera : undistorts the points
     name : of `KINDS`, checked by `require`
     """
-    detector, descriptor = make(name, count)
-    points = detector.detect(gray, None)
-    if points:
-        points = [points[i] for i in spread(*_places(points), gray.shape, count)]
-        points, descriptors = descriptor.compute(gray, points)
+    points, descriptors = _described(gray, name, count)
     if not points:
         return Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 1), dtype=np.uint8))
     xy_px = _places(points)[0]
     xy_n = camera.normalised(xy_px)
     good = np.isfinite(xy_n).all(axis=1)
     return Features(xy_px[good], xy_n[good], descriptors[good])
+
+
+def _described(gray: Gray, name: str, count: int) -> tuple[list[Any], Any]:
+    """Points of OpenCV with their descriptors."""
+    detector, descriptor = make(name, count)
+    described: Any = None
+    if KINDS[name].at_once:
+        points, described = detector.detectAndCompute(gray, None)
+    else:
+        points = detector.detect(gray)
+    if not points:
+        return [], None
+    best = spread(*_places(points), gray.shape, count)
+    chosen = [points[i] for i in best]
+    return (chosen, described[best]) if described is not None else descriptor.compute(gray, chosen)
 
 
 def _places(points: Sequence[Any]) -> tuple[Floats, Floats]:

@@ -39,6 +39,8 @@ LEAST_CONTRAST = 16.0
 LEAST_SHARPNESS = 0.5
 USUAL_OF, USUAL_FROM = 200, 5  # pictures
 _SMALL_PX = 400
+# Pictures closer than this share of the spacing asked for count as far enough apart: stamps jitter.
+NEARLY = 0.95
 
 # A marker in the compressed part of a JPEG: neither a stuffed byte, nor a restart, nor filling.
 _MARKER = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
@@ -66,9 +68,9 @@ class Picture:
 
 @dataclass(frozen=True)
 class Look:
-    """A picture opened: `gray` (h, w) where nothing is wrong with it by itself, else the `fault`."""
+    """A picture opened: `gray` (h, w), absent where a `fault` was seen."""
 
-    gray: Gray | None
+    gray: Gray | None = None
     fault: str = ""
     sharpness: float = 0.0
     fingerprint: bytes = b""
@@ -94,15 +96,13 @@ def pictures(session: Session) -> list[Picture]:
 
 
 def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
-    """At most `rate_hz` pictures a second of each camera: the first of each interval; all where the rate is 0."""
+    """At most `rate_hz` pictures a second of each camera; all where the rate is 0."""
     if rate_hz <= 0:
         return found
-    seen: set[tuple[str, int]] = set()
-    kept = []
+    least, last, kept = NEARLY * NS / rate_hz, dict[str, int](), list[Picture]()
     for picture in found:
-        interval = (picture.camera, int((picture.t_ns - found[0].t_ns) / NS * rate_hz + 0.01))
-        if interval not in seen:
-            seen.add(interval)
+        if picture.t_ns - last.get(picture.camera, -(2**62)) >= least:
+            last[picture.camera] = picture.t_ns
             kept.append(picture)
     return kept
 
@@ -110,19 +110,19 @@ def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
 def look(picture: Picture, camera: Camera | None) -> Look:
     """Open a picture and see what is wrong with it by itself."""
     if camera is None:
-        return Look(None, UNCALIBRATED)
+        return Look(fault=UNCALIBRATED)
     try:
         data = picture.path.read_bytes()
     except OSError:
-        return Look(None, MISSING)
+        return Look(fault=MISSING)
     gray = decoded(data)
     if gray is None:
-        return Look(None, BROKEN)
+        return Look(fault=BROKEN)
     if gray.shape != (camera.height, camera.width):
-        return Look(None, RESIZED)
+        return Look(fault=RESIZED)
     low, high = np.percentile(gray[::4, ::4], [1.0, 99.0])
     if high - low < LEAST_CONTRAST:
-        return Look(None, DARK)
+        return Look(fault=DARK)
     return Look(gray, "", sharpness(gray), hashlib.blake2b(gray.tobytes(), digest_size=16).digest())
 
 
@@ -188,7 +188,7 @@ class Judge:
 
     def fault(self, picture: Picture, seen: Look) -> str:
         """What is wrong with the picture; empty for a good one."""
-        if seen.gray is None:
+        if seen.fault:
             return seen.fault
         usual = self._usual.setdefault(picture.camera, deque(maxlen=USUAL_OF))
         blurred = len(usual) >= USUAL_FROM and seen.sharpness < LEAST_SHARPNESS * float(np.median(usual))
