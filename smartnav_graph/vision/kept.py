@@ -21,7 +21,7 @@ from smartnav_graph.files import replacing
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Stream
 from smartnav_graph.vision import images
-from smartnav_graph.vision.front_end import FrontEndConfig, Found, Progress, asked, find
+from smartnav_graph.vision.front_end import Found, FrontEndConfig, Progress, asked, find
 from smartnav_graph.vision.front_end_report import FrontEndReport
 from smartnav_graph.vision.pool import ordered, threads
 

@@ -1,0 +1,163 @@
+"""Match files of the SmartNav system of 2012: text, one match a row.
+
+    time0  time1  x0  y0  x1  y1
+
+Times in seconds of the session's clock. Coordinates in micrometres on the sensor, as the picture shows them (with the
+lens's distortion): the origin is the centre of the picture, x points right and y down; the sensor of that camera is
+4.54 mm wide and 3.42 mm high. Columns stand between commas, semicolons, tabs or blanks; lines that begin with # and a
+first line with names are passed over.
+
+    x_px = x_um / pitch + (width - 1) / 2,   pitch = 4540 um / width   (the centre of the first pixel is 0)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.errors import SessionError
+from smartnav_graph.files import replacing
+from smartnav_graph.readers.text import first_lines, read_text
+from smartnav_graph.streams import Images, Matches
+from smartnav_graph.timebase import NS, nearest
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+NAMES = ("time0", "time1", "x0", "y0", "x1", "y1")
+# Decimal places written: a nanometre, far below the noise of any match.
+PLACES = 3
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Size of the sensitive area, um; the default is that of the camera of 2012."""
+
+    width_um: float = 4540.0
+    height_um: float = 3420.0
+
+    def pixels(self, xy_um: Floats, camera: Camera) -> Floats:
+        """Pixels (n, 2) of sensor coordinates (n, 2)."""
+        return xy_um / self._pitch(camera) + self._centre(camera)
+
+    def micrometres(self, xy_px: Floats, camera: Camera) -> Floats:
+        """The inverse of `pixels`."""
+        return (xy_px - self._centre(camera)) * self._pitch(camera)
+
+    def _pitch(self, camera: Camera) -> Floats:
+        return np.array([self.width_um / camera.width, self.height_um / camera.height])
+
+    def _centre(self, camera: Camera) -> Floats:
+        return np.array([camera.width - 1, camera.height - 1]) / 2.0
+
+
+class Rows(NamedTuple):
+    """What a file holds: t0_ns, t1_ns (n,); xy0_um, xy1_um (n, 2) on the sensor."""
+
+    t0_ns: Times
+    t1_ns: Times
+    xy0_um: Floats
+    xy1_um: Floats
+
+
+def read(path: str | Path, sensor: Sensor | None = None) -> Rows:
+    """The rows of a match file.
+
+    Raises
+    ------
+    SessionError
+        Missing or unreadable file, rows of another length, a cell that is no number, a point outside the sensor.
+    """
+    path, sensor = Path(path), sensor or Sensor()
+    named = any(line.lower().startswith(NAMES[0]) for line in first_lines(path, 1))
+    table = read_text(path, names=None if named else NAMES)
+    table.require(NAMES)
+    rows = Rows(table.times("time0"), table.times("time1"), table.floats("x0", "y0"), table.floats("x1", "y1"))
+    half = np.array([sensor.width_um, sensor.height_um]) / 2.0
+    for label, xy in (("0", rows.xy0_um), ("1", rows.xy1_um)):
+        bad = np.argwhere(~(np.abs(xy) <= half))
+        if len(bad):
+            row, axis = map(int, bad[0])
+            found = f"{'xy'[axis]}{label} is {xy[row, axis]:g} at row {row} ({len(bad)} such values in all)"
+            expected = f"-{half[axis]:g} to {half[axis]:g} um from the picture's centre"
+            raise SessionError(path, found, expected, "give um on the sensor, x right, y down", row=row)
+    return rows
+
+
+def to_matches(
+    rows: Rows, images: Images, name: str, camera: Camera, *, sensor: Sensor | None = None, within_s: float = 0.02
+) -> tuple[Matches, int]:
+    """Matches between the session's images, in undistorted normalised coordinates, and how many rows found none.
+
+    Parameters
+    ----------
+    images, name : the session's, and which camera's; each time belongs to the nearest of its stamps, at most `within_s`
+        away
+    camera : of that name
+
+    Raises
+    ------
+    SessionError
+        No row belongs to two images.
+    """
+    mine = np.flatnonzero(images.camera == name)
+    if not len(mine):
+        raise SessionError("images", f"none of camera {name}", f"one of {', '.join(sorted(set(images.camera)))}")
+    stamps = images.t_ns[mine]
+    first, second = nearest(rows.t0_ns, stamps), nearest(rows.t1_ns, stamps)
+    apart = np.maximum(np.abs(stamps[first] - rows.t0_ns), np.abs(stamps[second] - rows.t1_ns))
+    good = (apart <= within_s * NS) & (first != second)
+    if not good.any():
+        told = [f"{t.min() / NS:.3f} to {t.max() / NS:.3f} s" for t in (rows.t0_ns, stamps)]
+        expected = f"times within {within_s:g} s of two images; those are from {told[1]}"
+        raise SessionError("match file", f"no row belongs to two images; times from {told[0]}", expected)
+    keep = np.flatnonzero(good)
+    keep = keep[np.lexsort((second[keep], first[keep]))]
+    sensor = sensor or Sensor()
+    at = [mine[first[keep]], mine[second[keep]]]
+    xy = [camera.normalised(sensor.pixels(um[keep], camera)) for um in (rows.xy0_um, rows.xy1_um)]
+    matches = Matches(
+        t_ns=images.t_ns[at[0]],
+        t_1_ns=images.t_ns[at[1]],
+        image_id_0=images.image_id[at[0]],
+        image_id_1=images.image_id[at[1]],
+        xy0_n=xy[0],
+        xy1_n=xy[1],
+    )
+    return matches, int((~good).sum())
+
+
+def write(
+    matches: Matches, path: str | Path, camera: Camera, *, sensor: Sensor | None = None, force: bool = False
+) -> None:
+    """Write matches of one camera as a match file: times with nine decimal places, coordinates with three.
+
+    Raises
+    ------
+    SessionError
+        The file exists and `force` is not given, or cannot be written.
+    """
+    sensor = sensor or Sensor()
+    um = [sensor.micrometres(camera.pixels(xy), camera) for xy in (matches.xy0_n, matches.xy1_n)]
+    lines = [f"# {' '.join(NAMES)}: s, um from the picture's centre, x right, y down"]
+    for t0, t1, one, other in zip(matches.t_ns.tolist(), matches.t_1_ns.tolist(), *um, strict=True):
+        places = " ".join(_fixed(value) for value in (*one, *other))
+        lines.append(f"{_seconds(t0)} {_seconds(t1)} {places}")
+    with replacing(path, force=force) as new:
+        new.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _fixed(value: float) -> str:
+    """Decimal text without a negative zero."""
+    return f"{round(float(value), PLACES) + 0.0:.{PLACES}f}"
+
+
+def _seconds(t_ns: int) -> str:
+    """Exact decimal text."""
+    whole, rest = divmod(abs(t_ns), NS)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
