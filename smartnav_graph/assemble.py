@@ -201,12 +201,16 @@ def placed(there: Kinematics, ahead_s: Floats, lever: Floats) -> Floats:
 
 
 def densify(problem: Problem, keyframes: Solution) -> Solution:
-    """The solution at the rate asked for. States by inertial prediction, covariances interpolated between keyframes."""
+    """The solution at the rate asked for, at keyframes and images if at none. States by inertial prediction,
+    covariances interpolated between keyframes."""
     rate = problem.config.run.rate
-    if rate == "keyframes":
-        return keyframes
     first, last = int(keyframes.t_ns[0]), int(keyframes.t_ns[-1])
-    if rate == "imu":
+    if rate == "keyframes":
+        seen = _image_times(problem)
+        t_ns = np.union1d(keyframes.t_ns, seen[(seen >= first) & (seen <= last)])
+        if len(t_ns) == len(keyframes.t_ns):
+            return keyframes
+    elif rate == "imu":
         imu = problem.session.require_imu()
         t_ns = imu.t_ns[(imu.t_ns >= first) & (imu.t_ns <= last)]
     else:
@@ -216,6 +220,15 @@ def densify(problem: Problem, keyframes: Solution) -> Solution:
     states = states_at(problem.windows, kinematics(keyframes), problem.session.gravity, t_ns)
     flat = interpolate(t_ns, keyframes.t_ns, keyframes.covariance.reshape(-1, 225))
     return replace(_solution(problem, t_ns, states, flat.reshape(-1, 15, 15)), residuals=keyframes.residuals)
+
+
+def _image_times(problem: Problem) -> NDArray[np.int64]:
+    """Stamps of all images of which there are matches or tracks."""
+    session = problem.session
+    found = [stream.t_ns for stream in (session.matches, session.tracks) if stream is not None]
+    if session.matches is not None:
+        found.append(session.matches.t_1_ns)
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
 
 
 def used_counts(problem: Problem, memory: Memory) -> Mapping[str, int]:

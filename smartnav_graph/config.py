@@ -14,6 +14,7 @@ import tomli_w
 from smartnav_graph.errors import ConfigError, SmartnavError
 from smartnav_graph.factors.barometer import BarometerConfig
 from smartnav_graph.factors.control import ControlConfig
+from smartnav_graph.factors.coplanarity import CoplanarityConfig
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.gravity import GravityConfig
 from smartnav_graph.factors.imu import ImuConfig
@@ -50,7 +51,7 @@ class RunConfig:
     vehicle : none, car, trolley or foot; empty takes the session's own
     sensors : names to use, or names with a leading minus to leave out; empty uses all
     withhold : specifications of rows kept back and scored; start_s, end_s : stretch, seconds since time zero
-    initial : "e,n,u,heading_deg[,sigma_m,sigma_deg]"; rate : ``keyframes``, ``imu`` or a frequency in Hz
+    initial : "e,n,u,heading_deg[,sigma_m,sigma_deg]"; rate : ``keyframes`` (and images), ``imu`` or a frequency in Hz
     passes : most solves of a batch run
     """
 
@@ -100,6 +101,7 @@ class Config:
     wheel: WheelConfig = field(default_factory=WheelConfig)
     barometer: BarometerConfig = field(default_factory=BarometerConfig)
     steps: StepConfig = field(default_factory=StepConfig)
+    coplanarity: CoplanarityConfig = field(default_factory=CoplanarityConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)

@@ -25,12 +25,14 @@ from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_state import initialiser_of
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
+from smartnav_graph.pair_gate import lost
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.revise import extra_passes, position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
+from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.start import Given, Initial
@@ -148,8 +150,18 @@ def solve_passes(
         # the truth, and a burst stands out against what is foretold.
         cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
         warm = first if cold else estimate.values
+        if learnt.stage > memory.stage and lost(problem.builders, estimate):
+            warm = _sequential(problem, windows, builders, learnt)
         memory = learnt
     raise AssertionError("unreachable")
+
+
+def _sequential(problem: Problem, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory) -> Any:
+    """Values to begin from where inertial data alone stray too far for what hangs on images: window by window, as a
+    replay has it, the trajectory never leaves what the images hold."""
+    smoother = incremental(ReplayConfig(), problem.session.t0_ns)
+    one_pass(smoother, windows, builders, replace(memory, phase="causal"), problem)
+    return smoother.values()
 
 
 def _forget(builders: Sequence[Builder]) -> None:

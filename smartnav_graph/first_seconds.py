@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from smartnav_graph.graph import Window
 from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import seconds_since
+from smartnav_graph.timebase import NS, seconds_since
 
 Floats = NDArray[np.float64]
+
+# Specific force (m/s^2) that a rest may differ from gravity by: the bias. Sigma of a mean rate, rad/s, at least.
+LEVEL, LEAST_RATE_SIGMA = 0.6, 3e-4
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def find_rest(imu: Imu, start_ns: int, gravity: float, shortest_s: float, longes
             break
         quiet = gyro[i:j].std(axis=0).max() < 0.01 and accel[i:j].std(axis=0).max() < 0.12
         steady = np.abs(accel[i:j].mean(axis=0) - accel[: edges[1]].mean(axis=0)).max() < 0.08
-        level = abs(np.linalg.norm(accel[i:j].mean(axis=0)) - gravity) < 0.6
+        level = abs(np.linalg.norm(accel[i:j].mean(axis=0)) - gravity) < LEVEL
         still = np.abs(gyro[i:j].mean(axis=0) - gyro[: edges[1]].mean(axis=0)).max() < 0.005
         if not (quiet and steady and level and still):
             break
@@ -57,8 +60,19 @@ def find_rest(imu: Imu, start_ns: int, gravity: float, shortest_s: float, longes
     if last == 0 or t[last - 1] < shortest_s:
         return None
     scatter = float(gyro[:last].std(axis=0).max())
-    sigma = max(scatter / np.sqrt(last), 3e-4)
+    sigma = max(scatter / np.sqrt(last), LEAST_RATE_SIGMA)
     return Rest(accel[:last].mean(axis=0), gyro[:last].mean(axis=0), sigma, float(t[last - 1]))
+
+
+def rest_over(imu: Imu, start_ns: int, end_ns: int, gravity: float) -> Rest | None:
+    """The rest that is known to last from `start_ns` to `end_ns`, however much a motor shakes it; None where the mean
+    specific force is not gravity."""
+    inside = slice(np.searchsorted(imu.t_ns, start_ns), np.searchsorted(imu.t_ns, end_ns, side="right"))
+    accel, gyro = imu.accel[inside], imu.gyro[inside]
+    if len(accel) < 4 or abs(np.linalg.norm(accel.mean(axis=0)) - gravity) > LEVEL:
+        return None
+    sigma = max(float(gyro.std(axis=0).max()) / np.sqrt(len(gyro)), LEAST_RATE_SIGMA)
+    return Rest(accel.mean(axis=0), gyro.mean(axis=0), sigma, (end_ns - start_ns) / NS)
 
 
 def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> tuple[Floats, Floats, Floats]:

@@ -46,8 +46,17 @@ def initialiser_of(problem: Problem, longest_s: float | None = None) -> Initiali
         standstill=problem.rests_at_start,
         attitude_start=_oriented(problem, causal=causal),
         walk=_walked(problem, (t_ns, positions), known, config.max_stretch_s if causal else None),
+        rest_end_ns=_standing(problem, config.rest_s),
         **_north(problem, causal=causal),
     )
+
+
+def _standing(problem: Problem, shortest_s: float) -> int | None:
+    """End of the standstill that the first keyframe lies in, if it lasts long enough."""
+    start = problem.windows[0].t1_ns
+    spans = [] if problem.rests is None else problem.rests.spans()
+    ends = [b for a, b in spans if a <= start < b and b - start >= shortest_s * NS]
+    return ends[0] if ends else None
 
 
 def _walked(problem: Problem, fixes: tuple[Times, Floats], known: Times, causal_s: float | None) -> Walk | None:

@@ -290,6 +290,7 @@ class Memory:
     held : session states that stay at a value (d,), by name
     stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
     constraints, time offsets, magnetometer, steps)
+    settled : passes that a builder has spent on judging what it is made of
     weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``graduated`` (truncated least
     squares by and by, where asked for), ``gated`` (least squares without outliers), ``causal`` (replay: least squares,
@@ -302,6 +303,7 @@ class Memory:
     held: Mapping[str, Floats] = field(default_factory=dict)
     stage: int = 0
     phase: str = "plain"
+    settled: Mapping[str, int] = field(default_factory=dict)
     weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     control: float = 0.0
 

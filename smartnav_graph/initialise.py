@@ -24,7 +24,7 @@ from smartnav_graph.errors import SolverError
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
 from smartnav_graph.first_attitude import AttitudeStart
 from smartnav_graph.first_field import FieldStart
-from smartnav_graph.first_seconds import Rest, find_rest, inertial_curve, kabsch_attitude
+from smartnav_graph.first_seconds import LEAST_RATE_SIGMA, Rest, find_rest, inertial_curve, kabsch_attitude, rest_over
 from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.start import Given, Initial, InitialiseConfig
@@ -40,7 +40,6 @@ GOOD_COST = 2.5
 REJECTION_COST = 10.0
 # Share of the keyframes whose fixes a good start may reject beyond those that disagreed with it before.
 MORE_REJECTED = 0.05
-LEAST_RATE_SIGMA = 3e-4  # rad/s
 # Tilt (rad) that levelling by the accelerometer may be off.
 LEVELLED = 0.1
 # Heading (rad) that iron nearby may turn a magnetometer by.
@@ -67,7 +66,7 @@ class Initialiser:
     standstill : factors of their own say that a rest at the start does not move and does not turn
     iron_sigma : hard iron (uT) that the magnetometer may still hold; magnetic_stage : from which its factor speaks;
     field_start : where north is by the first seconds, where they tell; attitude_start : the attitude that fixes bring;
-    walk : a walker's way at first sight
+    walk : a walker's way at first sight; rest_end_ns : end of a standstill at the start that others told of
     """
 
     windows: Sequence[Window]
@@ -87,6 +86,7 @@ class Initialiser:
     field_start: FieldStart | None = None
     attitude_start: AttitudeStart | None = None
     walk: Walk | None = None
+    rest_end_ns: int | None = None
     sources: Sequence[tuple[str, int]] = ()
     arrival_ns: NDArray[np.int64] | None = None
 
@@ -100,6 +100,8 @@ class Initialiser:
         """
         start_ns = self.windows[0].t1_ns
         rest = find_rest(self.imu, start_ns, self.gravity, self.config.rest_s)
+        if rest is None and self.rest_end_ns is not None:
+            rest = rest_over(self.imu, start_ns, self.rest_end_ns, self.gravity)
         if rest is not None and self._moving(start_ns, rest.length_s):
             rest = None
         if given is not None:

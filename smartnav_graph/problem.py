@@ -23,6 +23,7 @@ from smartnav_graph.session import Session
 from smartnav_graph.standstill import Standstills, find_standstills
 from smartnav_graph.streams import Positioned
 from smartnav_graph.timebase import NS, Gap, find_gaps
+from smartnav_graph.vision.still import still_periods
 from smartnav_graph.withhold import split
 
 # Why a row that replay was handed is not in its solution.
@@ -110,8 +111,10 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
-    rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still)
-    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal)
+    context = FactorContext(session, calibration, gaps, vehicle, config, None, causal)
+    seen = None if context.pairs is None else still_periods(context.pairs)
+    rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still, seen)
+    context = replace(context, rests=rests)
     windows, lost = cut(context, span)
     for name, count in lost.items():
         dropped.setdefault(name, {})["arrived after the end"] = count
@@ -143,7 +146,7 @@ def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], di
     merge = round(spacing.merge_s * NS)
     streams = session.absolute()
     aiding = {name: stream.t_ns for name, stream in streams.items()}
-    epochs = [stream.known_ns if causal else stream.t_ns for stream in streams.values()]
+    epochs = [stream.known_ns if causal else stream.t_ns for stream in streams.values()] + [context.image_ns]
     times = keyframe_times(span, epochs, context.gaps, spacing, standing)
     imu = bridged(session.require_imu(), context.gaps, context.bridges)
     windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
@@ -244,7 +247,7 @@ def _trimmed(
 
 def _unused(session: Session) -> list[str]:
     """Streams that are there but have no factor."""
-    used = {*BUILDERS, "reference", "images"}
+    used = {*BUILDERS, "reference", "images", "tracks", "matches"}
     idle = [name for name in session.streams() if name not in used]
     return [f"{name}: present, not used by the estimator" for name in idle]
 

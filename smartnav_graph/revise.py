@@ -22,6 +22,7 @@ from smartnav_graph import graduated
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import skew, turned
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
+from smartnav_graph.pair_gate import settled
 from smartnav_graph.row_noise import row_scales
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.variance import noise_scales
@@ -163,6 +164,17 @@ def revise(
     builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory
 ) -> tuple[Memory, bool]:
     """The memory for the next pass, and whether there is nothing more to learn."""
+    new, done = _revised(builders, windows, estimate, memory)
+    if new.stage < LAST_STAGE:
+        return new, done
+    judged = settled(builders, estimate, new)
+    return judged, done and judged is new
+
+
+def _revised(
+    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, memory: Memory
+) -> tuple[Memory, bool]:
+    """The same by fixes and inertial data alone."""
     found = {b.name: (b, fix_residuals(b, windows, estimate, memory)) for b in position_builders(builders)}
     found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
     new = memory

@@ -172,6 +172,7 @@ def find_standstills(
     noise: ImuNoise,
     gravity: float,
     config: StandstillConfig,
+    seen: StaticPeriod | None = None,
 ) -> Standstills:
     """The standstills of a recording.
 
@@ -182,6 +183,7 @@ def find_standstills(
     ----------
     vehicle : none, car, trolley or foot: only on foot, or where nothing is known, can the device be foot-mounted
     noise : of the sensor, densities; gravity m/s^2
+    seen : periods in which a camera stood still
     """
     found = Standstills.none(imu.t_ns)
     if config.detect and len(imu) > 2:
@@ -194,8 +196,9 @@ def find_standstills(
             speed = stance_speed(imu, gravity, config.detector)
             speed = np.where(np.isnan(speed), found.speed_sigma, speed)
             found = Standstills(imu.t_ns, speed, found.turn_sigma, True)
-    if config.listed and listed is not None:
-        found = _with_listed(found, listed)
+    for periods, wanted in ((listed, config.listed), (seen, config.detect)):
+        if wanted and periods is not None:
+            found = _with_listed(found, periods)
     speed, turn = found.speed_sigma.copy(), found.turn_sigma.copy()
     for gap in gaps:
         inside = slice(*np.searchsorted(imu.t_ns, [gap.start_ns, gap.end_ns + 1]))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from smartnav_graph.factors import (
     barometer,
     control,
+    coplanarity,
     gnss,
     gravity,
     imu,
@@ -37,4 +38,5 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "gravity": gravity.build,
     "barometer": barometer.build,
     "steps": step.build,
+    "coplanarity": coplanarity.build,
 }

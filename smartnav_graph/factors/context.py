@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.factors import bridging
 from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.session import Session
 from smartnav_graph.standstill import Standstills
-from smartnav_graph.timebase import Gap
+from smartnav_graph.timebase import NS, Gap
+from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,38 @@ class FactorContext:
         """The bridge of every gap, by its start stamp."""
         noise = self.calibration.imu_noise
         return bridging.bridges(self.session.require_imu(), self.gaps, noise, causal=self.causal)
+
+    @cached_property
+    def camera_name(self) -> str:
+        """The camera whose matches or tracks there are: that of the images, else the only one that is calibrated."""
+        images, known = self.session.images, self.calibration.cameras
+        if images is not None and len(images):
+            names, count = np.unique(images.camera.astype(str), return_counts=True)
+            return str(names[np.argmax(count)])
+        return next(iter(known), "camera")
+
+    @property
+    def camera(self) -> Camera | None:
+        """The calibration of that camera, where there is one."""
+        return self.calibration.cameras.get(self.camera_name)
+
+    @cached_property
+    def pairs(self) -> Pairs | None:
+        """Pairs of images: as they were matched, else along tracks; None where images are not to be used."""
+        options, session = self.config.coplanarity, self.session
+        if not options.enabled:
+            return None
+        if session.matches is not None:
+            return of_matches(session.matches)
+        return None if session.tracks is None else of_tracks(session.tracks, options.rate_hz, options.spans)
+
+    @property
+    def image_ns(self) -> NDArray[np.int64]:
+        """Stamps of the keyframes at the images of the pairs, by the clock offset that the calibration knows."""
+        if self.pairs is None:
+            return np.zeros(0, dtype=np.int64)
+        offset = 0.0 if self.camera is None else self.camera.time_offset_s
+        return np.asarray(self.pairs.t_ns + round(offset * NS))
 
     @property
     def on_foot(self) -> bool:

@@ -188,25 +188,28 @@ def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, F
 class CompressedRows:
     """Row model of pairs whose inliers are settled: what all matches say of the nine entries of E in nine rows.
 
-        W = sum k k^T / s_0^2 = L L^T,   k = x0~ kron x1~,   r = L^T vec(E) / (sigma sqrt(vec(E)^T N vec(E)))
+        W = sum w k k^T / s_0^2 = L L^T,   k = x0~ kron x1~,   r = L^T vec(E) / (sigma sqrt(vec(E)^T N vec(E)))
 
-    s_0 of each match is frozen where it was compressed; the common length of E is not: N = sum N_i / sum s_0i^2 with
-    s_i^2 = vec(E)^T N_i vec(E). Exact but for the change of the weights relative to each other.
+    s_0 of each match and its weight w under the loss are frozen where it was compressed; the common length of E is not:
+    N = sum N_i / sum s_0i^2 with s_i^2 = vec(E)^T N_i vec(E). Exact but for the change of the weights relative to each
+    other.
     """
 
-    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, R: Floats, t: Floats) -> None:
+    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float, frozen: Relative) -> None:
         self.rig, self.sigma = rig, sigma
         self.letters = rig.letters
         a, b = (rays(np.asarray(pairs.padded(x))) for x in (pairs.x0, pairs.x1))
-        E = essential(R, t)
+        E = essential(frozen.R, frozen.t)
         l0, l1 = b @ E.transpose(0, 2, 1), a @ E
         square = (l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + BASELINE_FLOOR_M**2
-        k = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:2], 9) * (use / np.sqrt(square))[..., None]
+        white = ((a * l0).sum(axis=-1) ** 2 / square) / sigma**2
+        weight = use * loss_weights(white, "cauchy", reach)[0]
+        k = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:2], 9) * np.sqrt(weight / square)[..., None]
         values, vectors = np.linalg.eigh(k.transpose(0, 2, 1) @ k)
         self.root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
-        total = np.maximum((square * use).sum(axis=1), 1e-300)
-        self.length = _lengths(a, b, use) / total[:, None, None]
-        self.floor = BASELINE_FLOOR_M**2 * use.sum(axis=1) / total
+        total = np.maximum((square * weight).sum(axis=1), 1e-300)
+        self.length = _lengths(a, b, weight) / total[:, None, None]
+        self.floor = BASELINE_FLOOR_M**2 * weight.sum(axis=1) / total
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         """See `graph.RowModel`."""
@@ -221,10 +224,10 @@ class CompressedRows:
         return r, [by @ by_e @ jacobian for jacobian in there.by]
 
 
-def _lengths(a: Floats, b: Floats, use: Mask) -> Floats:
+def _lengths(a: Floats, b: Floats, weight: Floats) -> Floats:
     """sum N_i (n, 9, 9), s_i^2 = vec(E)^T N_i vec(E): E b has the squares of its first two rows, E^T a likewise."""
-    bb = (b * use[..., None]).transpose(0, 2, 1) @ b
-    aa = (a * use[..., None]).transpose(0, 2, 1) @ a
+    bb = (b * weight[..., None]).transpose(0, 2, 1) @ b
+    aa = (a * weight[..., None]).transpose(0, 2, 1) @ a
     flat = np.diag([1.0, 1.0, 0.0])
     n = len(a)
     first = np.einsum("ij,nkl->nikjl", flat, bb).reshape(n, 9, 9)

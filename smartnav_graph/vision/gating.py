@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.vision.epipolar import rays
+from smartnav_graph.vision.epipolar import cross, rays
 from smartnav_graph.vision.pairs import Pairs
 
 Floats = NDArray[np.float64]
@@ -44,8 +44,7 @@ def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
     R : (n, 3, 3) c0_R_c1 of each pair; sigma : (n,) of a good match in normalised coordinates, the turn's own
     uncertainty included
     """
-    a, b = (np.asarray(pairs.padded(rays(x))) for x in (pairs.x0, pairs.x1))
-    geometry = _Geometry(a, b @ R.transpose(0, 2, 1), R, pairs.there)
+    geometry = Geometry.of(pairs, R)
     limit = (AGREES * sigma[:, None]) ** 2
     rng = np.random.default_rng(seed)
     best, cost = np.tile([0.0, 0.0, 1.0], (len(R), 1)), np.full(len(R), np.inf)
@@ -59,7 +58,7 @@ def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
     return Gated((geometry.square(best) < limit) & pairs.there, best, geometry.parallax())
 
 
-def _better(geometry: _Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
+def _better(geometry: Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
     """The better of two baselines (n, 3) of each pair, and its cost (n,)."""
     size = np.linalg.norm(tried, axis=1, keepdims=True)
     tried = np.where(size > 1e-12, tried / np.maximum(size, 1e-12), best)
@@ -68,12 +67,17 @@ def _better(geometry: _Geometry, tried: Floats, limit: Floats, best: Floats, cos
     return np.where(take[:, None], tried, best), np.where(take, new, cost)
 
 
-class _Geometry:
-    """Rays a, y (n, k, 3) of both images in the axes of the first one."""
+class Geometry:
+    """Pairs whose turn R (n, 3, 3) is known: rays a, y (n, k, 3) of both images in the axes of the first one."""
 
     def __init__(self, a: Floats, y: Floats, R: Floats, there: Mask) -> None:
         self.a, self.y, self.R, self.there = a, y, R, there
-        self.normals = np.cross(y, a)
+        self.normals = cross(y, a)
+
+    @classmethod
+    def of(cls, pairs: Pairs, R: Floats) -> Geometry:
+        a, b = (np.asarray(pairs.padded(rays(x))) for x in (pairs.x0, pairs.x1))
+        return cls(a, b @ R.transpose(0, 2, 1), R, pairs.there)
 
     def normals_at(self, place: NDArray[np.intp]) -> Floats:
         """Normal (n, 3) of one match a pair."""
@@ -81,8 +85,8 @@ class _Geometry:
 
     def scale(self, t: Floats) -> Floats:
         """s^2 (n, k) of `epipolar.sampson`."""
-        l0 = np.cross(t[:, None], self.y)
-        l1 = np.cross(self.a, t[:, None]) @ self.R
+        l0 = cross(t[:, None], self.y)
+        l1 = cross(self.a, t[:, None]) @ self.R
         return np.asarray((l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + 1e-18)
 
     def square(self, t: Floats) -> Floats:

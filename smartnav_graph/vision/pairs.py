@@ -58,6 +58,12 @@ class Pairs:
         """Mask (n, k) of the places that hold a match."""
         return self.slots >= 0
 
+    def of(self, rows: Ints) -> Pairs:
+        """Some of the pairs, in ascending order."""
+        chosen = np.isin(self.pair, rows)
+        pair = np.searchsorted(rows, self.pair[chosen])
+        return Pairs(self.t_ns, self.images[rows], self.x0[chosen], self.x1[chosen], pair)
+
     def padded(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
         """One value or row a match (m, ...) as (n, k, ...); zero in empty places."""
         if not len(values):

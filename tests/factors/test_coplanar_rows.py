@@ -81,7 +81,7 @@ def test_nothing_is_left_at_the_truth(rng, rig):
     assert np.abs(residual).max() < 1e-9
     assert all(jacobian[:, 6].any() == 0 for jacobian in jacobians)
     there = relative(rig, states, data)
-    small = CompressedRows(pairs, rig, SIGMA, pairs.there, there.R, there.t)
+    small = CompressedRows(pairs, rig, SIGMA, pairs.there, 1e6, there)
     assert np.abs(small.linearize(states, data)[0]).max() < 1e-3  # sigmas; the root of rounding
 
 
@@ -120,7 +120,7 @@ def test_compressed_pairs_have_the_same_minimum_and_curvature(rng):
     pairs, states, data = scene(rng, noise=0.3 * SIGMA)
     there = relative(RIG, states, data)
     full = PairRows(pairs, RIG, SIGMA, pairs.there, 1e6)
-    small = CompressedRows(pairs, RIG, SIGMA, pairs.there, there.R, there.t)
+    small = CompressedRows(pairs, RIG, SIGMA, pairs.there, 1e6, there)
     a, A = full.linearize(states, data)
     b, B = small.linearize(states, data)
     np.testing.assert_allclose((b**2).sum(axis=1), (a**2).sum(axis=1), rtol=1e-6)
@@ -144,7 +144,7 @@ def test_rows_fall_with_their_derivatives(rng, rig, kind):
     rows = (
         PairRows(pairs, rig, SIGMA, pairs.there, 2.0)
         if kind == "pairs"
-        else CompressedRows(pairs, rig, SIGMA, pairs.there, there.R, there.t)
+        else CompressedRows(pairs, rig, SIGMA, pairs.there, 1e6, there)
     )
     residual, jacobians = rows.linearize(states, data)
     h = 1e-6
@@ -170,7 +170,7 @@ def test_no_baseline_is_harmless(rng):
     there = relative(RIG, still, data)
     for rows in (
         PairRows(pairs, RIG, SIGMA, pairs.there, 2.0),
-        CompressedRows(pairs, RIG, SIGMA, pairs.there, there.R, there.t),
+        CompressedRows(pairs, RIG, SIGMA, pairs.there, 1e6, there),
     ):
         residual, jacobians = rows.linearize(still, data)
         assert np.abs(residual).max() < 1e-9 and all(np.isfinite(jacobian).all() for jacobian in jacobians)

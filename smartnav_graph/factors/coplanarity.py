@@ -1,0 +1,240 @@
+"""Coplanarity of matched rays: what two images say of the motion between them, without any point in space.
+
+A pair joins when the trajectory without images is found. Its matches are judged by the turn that the inertial data
+tell, then at the smoothed states, then once more, whereupon they are compressed: never by the pair's own fit, which a
+tracker that slipped as a whole makes as well as any other. Where most pairs contradict the inertial solution, that is
+too poor to judge them, and none is used: images never make a trajectory worse.
+
+Source: Longuet-Higgins (1981), A computer algorithm for reconstructing a scene from two projections, Nature 293; the
+factor in a graph after Indelman, Roberts, Beall, Dellaert (2012), Incremental light bundle adjustment, BMVC.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, PairRows, Relative, Rig
+from smartnav_graph.factors.gnss import clock_state
+from smartnav_graph.factors.observation import exp
+from smartnav_graph.graph import Block, Memory, RowModel, SessionState, State, Step, Window, key
+from smartnav_graph.timebase import NS
+from smartnav_graph.vision.gating import gate
+from smartnav_graph.vision.pairs import Pairs
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# How sure the turn between two images is, rad and rad/s: what is left of the gyro's bias and noise.
+TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
+# Share of its matches that a pair must keep.
+LEAST_SHARE = 0.5
+# How far matches are settled (`Memory.settled`): by the turn, at states found with images, once more and compressed.
+BY_TURN, BY_STATES, COMPRESSED = 1, 2, 3
+# Reach of the loss, in sigmas, while the trajectory is that of inertial data, whose way is far from that of the images.
+FIRST_REACH = 2.0
+# What a pair's own pose takes of its matches.
+POSE_DOF = 5
+# Sigma of a match in normalised coordinates where no camera is calibrated: 0.7 px of a phone's 640 x 480.
+UNKNOWN_CAMERA = 1.5e-3
+
+
+@dataclass(frozen=True)
+class CoplanarityConfig:
+    """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
+    least_parallax (rad, median once the turn is taken out) : of a pair; reach : of the Cauchy loss of a match, sigmas;
+    compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's
+    attitude in the body and of its clock as states (zero: as calibrated)."""
+
+    enabled: bool = True
+    rate_hz: float = 4.0
+    spans: tuple[int, ...] = (1, 2, 4, 8)
+    least_matches: int = 6
+    least_parallax: float = 0.01
+    reach: float = 2.0
+    compress: bool = True
+    boresight_sigma_deg: float = 0.0
+    time_offset_sigma: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1 and self.least_matches >= POSE_DOF):
+            found = f"rate_hz = {self.rate_hz}, spans = {self.spans}, least_matches = {self.least_matches}"
+            raise ConfigError("config [coplanarity]", found, f"> 0, whole numbers >= 1, at least {POSE_DOF}")
+        if not (self.reach > 0 and min(self.least_parallax, self.boresight_sigma_deg, self.time_offset_sigma) >= 0):
+            raise ConfigError("config [coplanarity]", f"{self}", "reach > 0, parallax and sigmas >= 0")
+
+
+# Why a pair is not used, in words.
+REASONS = (
+    "in use",
+    "outside the stretch",
+    "too few matches",
+    "no baseline to speak of",
+    "contradicts the turn or the way",
+)
+IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
+
+
+@dataclass
+class CoplanarityBuilder:
+    """Adds the pairs that end at a keyframe.
+
+    image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; sigma : of a match, normalised
+    rate (k, 3) rad/s : of the body at each image
+    verdict (n,) : what became of each pair, places in `REASONS`; refused : why none is used, in words; frozen :
+    relative poses of the pairs (n) where their inliers were settled
+    """
+
+    pairs: Pairs
+    image_ns: NDArray[np.int64]
+    rig: Rig
+    sigma: float
+    merge_ns: int
+    config: CoplanarityConfig = field(default_factory=CoplanarityConfig)
+    note: str = ""
+    name: str = "coplanarity"
+    stage: int = 1
+    verdict: NDArray[np.intp] = field(init=False)
+    rate: Floats = field(init=False)
+    refused: str = ""
+    frozen: Relative | None = None
+    _keyframe: dict[int, int] = field(default_factory=dict)
+    _turn: dict[int, Floats] = field(default_factory=dict)
+    _now: Floats = field(default_factory=lambda: np.eye(3))
+    _made: tuple[tuple[object, ...], RowModel] | None = None
+
+    def __post_init__(self) -> None:
+        self.verdict = np.full(len(self.pairs), OUTSIDE, dtype=np.intp)
+        self.rate = np.zeros((len(self.image_ns), 3))
+
+    # --- one window ---
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """The pairs whose second image stands at the window's end."""
+        if previous is None:
+            self._begin()
+        elif memory.phase == "causal":
+            self._go_on(window, previous)
+        image = self._image_at(window.t1_ns)
+        if image is None:
+            return
+        bias = np.zeros(3) if previous is None else previous.bias.gyroscope()
+        self._keyframe[image], self._turn[image] = window.index, self._now
+        self.rate[image] = window.gyro[-1] - bias if len(window.gyro) else np.zeros(3)
+        first, last = np.searchsorted(self.pairs.images[:, 1], [image, image + 1])
+        ending = [k for k in range(first, last) if int(self.pairs.images[k, 0]) in self._keyframe]
+        if ending:
+            self._add_pairs(step, window, np.array(ending, dtype=np.intp), memory)
+
+    def _add_pairs(self, step: Step, window: Window, ending: NDArray[np.intp], memory: Memory) -> None:
+        model = self._model(memory)
+        if memory.phase == "causal":
+            self._judge_now(model, ending)
+            ending = ending[self.verdict[ending] == IN_USE]
+        else:
+            ending = ending[memory.used(self.name, ending)]
+        if not len(ending):
+            return
+        states = {state.letter: state for state in self._states()}
+        keys, data = [], np.empty((len(ending), COLUMNS))
+        for row, pair in enumerate(ending):
+            images = [int(i) for i in self.pairs.images[pair]]
+            own = iter([key("X", self._keyframe[i]) for i in images])
+            speed = iter([key("V", self._keyframe[i]) for i in images])
+            of = {"X": own, "V": speed}
+            keys.append(tuple(next(of[a]) if a in of else step.use(states[a]) for a in self.rig.letters))
+            data[row] = [pair, *self.rate[images].ravel()]
+        step.blocks.append(Block(self.name, model, keys, data, window.t1_ns, rows=tuple(int(k) for k in ending)))
+
+    def _begin(self) -> None:
+        """Forget the pass before."""
+        self._keyframe, self._turn, self._now = {}, {}, np.eye(3)
+
+    def _go_on(self, window: Window, previous: State) -> None:
+        """Carry the attitude since the start over one window."""
+        for turn in exp((window.gyro - previous.bias.gyroscope()) * window.dt[:, None]):
+            self._now = self._now @ turn
+
+    def _image_at(self, t_ns: int) -> int | None:
+        """The image whose keyframe this is."""
+        near = int(np.searchsorted(self.image_ns, t_ns - self.merge_ns))
+        found = near < len(self.image_ns) and abs(int(self.image_ns[near]) - t_ns) <= self.merge_ns
+        return near if found else None
+
+    def _states(self) -> list[SessionState]:
+        """Session states of the camera."""
+        sigma = np.full(3, np.radians(self.config.boresight_sigma_deg))
+        found = []
+        if self.rig.timed:
+            found.append(clock_state("images", self.config.time_offset_sigma))
+        if self.rig.boresight:
+            found.append(SessionState("A", "images", "camera_boresight_rad", np.zeros(3), sigma))
+        return found
+
+    def _model(self, memory: Memory) -> RowModel:
+        """The row model of a pass: made anew where what was learnt changed."""
+        learnt = memory.rejected.get("matches"), memory.settled.get(self.name, 0), memory.scale(self.name), memory.phase
+        if self._made is None or any(a is not b and a != b for a, b in zip(self._made[0], learnt, strict=True)):
+            self._made = (learnt, self._new_model(memory))
+        return self._made[1]
+
+    def _new_model(self, memory: Memory) -> RowModel:
+        sigma = self.sigma * memory.scale(self.name)
+        if memory.phase == "causal":
+            return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), self.config.reach)
+        use, settled = self._padded_use(memory), memory.settled.get(self.name, 0)
+        if settled == BY_TURN:
+            return PairRows(self.pairs, self.rig, sigma, use, FIRST_REACH)
+        if settled == COMPRESSED and self.frozen is not None and self.config.compress:
+            return CompressedRows(self.pairs, self.rig, sigma, use, self.config.reach, self.frozen)
+        return PairRows(self.pairs, self.rig, sigma, use, self.config.reach)
+
+    def _padded_use(self, memory: Memory) -> Mask:
+        use = memory.used("matches", np.arange(len(self.pairs.pair)))
+        return np.asarray(self.pairs.padded(use), dtype=bool)
+
+    # --- which matches ---
+
+    def _judge_now(self, model: RowModel, ending: NDArray[np.intp]) -> None:
+        """Judge new pairs by the turn since their first image."""
+        assert isinstance(model, PairRows)
+        C = self.rig.body_R_cam
+        turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.pairs.images[ending]]
+        some = self.pairs.of(ending)
+        use, self.verdict[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
+        model.use[ending, : use.shape[1]] = use
+
+    def by_turn(self, pairs: Pairs, R: Floats) -> tuple[Mask, NDArray[np.intp]]:
+        """Matches that agree with the turn (padded), and the verdict on each pair."""
+        sigma = np.hypot(self.sigma, TURN_SIGMA + TURN_DRIFT * pairs.length_s)
+        found = gate(pairs, R, sigma)
+        return found.inliers, self.judged(pairs, found.inliers, found.parallax)
+
+    def judged(self, pairs: Pairs, use: Mask, parallax: Floats) -> NDArray[np.intp]:
+        """Verdict (n,) by the matches in use (n, k) and the median parallax (n,) rad."""
+        kept = use.sum(axis=1)
+        share = kept / np.maximum(pairs.count, 1)
+        few = (pairs.count < self.config.least_matches) | ((share >= LEAST_SHARE) & (kept < self.config.least_matches))
+        still, contrary = parallax < self.config.least_parallax, share < LEAST_SHARE
+        return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
+
+
+def build(context: FactorContext) -> CoplanarityBuilder | None:
+    """The builder of a session's image pairs."""
+    pairs, config, camera = context.pairs, context.config.coplanarity, context.camera
+    if pairs is None or not len(pairs):
+        return None
+    mount = context.session.mount(context.camera_name)
+    rig = Rig(
+        np.array(mount.body_R, dtype=np.float64),
+        np.array(mount.body_t, dtype=np.float64),
+        boresight=config.boresight_sigma_deg > 0,
+        timed=config.time_offset_sigma > 0,
+    )
+    sigma = UNKNOWN_CAMERA if camera is None else camera.noise
+    merge = round(context.config.keyframes.merge_s * NS)
+    return CoplanarityBuilder(pairs, context.image_ns, rig, sigma, merge, config)

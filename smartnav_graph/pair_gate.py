@@ -1,0 +1,133 @@
+"""Which image pairs, and which of their matches, an estimate believes: pass by pass until they are settled.
+
+First by the turn that inertial data tell (two matches give the baseline); then at the smoothed states; then once more,
+whereupon pairs are compressed. Where too few pairs agree with the solution without images, that is too poor to judge
+them, and none is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.factors.coplanar_rows import COLUMNS, Relative, relative
+from smartnav_graph.factors.coplanarity import (
+    COMPRESSED,
+    CONTRARY,
+    IN_USE,
+    OUTSIDE,
+    POSE_DOF,
+    CoplanarityBuilder,
+)
+from smartnav_graph.graph import Builder, Memory
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.vision.epipolar import sampson
+from smartnav_graph.vision.gating import Geometry
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A match within so many sigmas of the smoothed states is one.
+GATE = 4.0
+# Share of the pairs with a baseline that must be kept for any to be used.
+LEAST_PAIRS = 0.5
+# A pair is astray when its second image is less sure than this share of the baseline; pairs that may be.
+LARGEST_STRAY, FEW_ASTRAY = 0.3, 0.1
+# Sigma of a match beside that of its class: least and most.
+SCALES = (0.3, 3.0)
+
+
+def settled(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> Memory:
+    """The memory with the matches that agree with an estimate; unchanged once they are settled."""
+    for builder in builders:
+        if isinstance(builder, CoplanarityBuilder) and memory.settled.get(builder.name, 0) < COMPRESSED:
+            memory = _judged(builder, estimate, memory)
+    return memory
+
+
+def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> Memory:
+    passed, scale = memory.settled.get(builder.name, 0), memory.scale(builder.name)
+    there, inside = relative_poses(builder, estimate)
+    if passed == 0:
+        use, verdict = builder.by_turn(builder.pairs, there.R)
+    else:
+        use, verdict, scale = _by_states(builder, there, scale)
+    verdict = np.where(inside, verdict, OUTSIDE)
+    builder.refused = _refusal(verdict)
+    builder.verdict = np.where(verdict == IN_USE, CONTRARY, verdict) if builder.refused else verdict
+    builder.frozen = there
+    used = np.asarray(builder.pairs.flat(use & (builder.verdict == IN_USE)[:, None]))
+    rejected = {
+        "matches": frozenset(np.flatnonzero(~used).tolist()),
+        builder.name: frozenset(np.flatnonzero(builder.verdict != IN_USE).tolist()),
+    }
+    return replace(
+        memory,
+        rejected={**memory.rejected, **rejected},
+        noise_scales={**memory.noise_scales, builder.name: scale},
+        settled={**memory.settled, builder.name: COMPRESSED if builder.refused else passed + 1},
+    )
+
+
+def lost(builders: Iterable[Builder], estimate: Estimate) -> bool:
+    """Whether the way between images is so poorly known that what they say of it may be far: a redescending loss does
+    not find the way back, and a baseline fits as well the other way round."""
+    for builder in builders:
+        if isinstance(builder, CoplanarityBuilder):
+            there, inside = relative_poses(builder, estimate)
+            sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
+            second = np.clip(np.searchsorted(estimate.t_ns, builder.image_ns), 0, len(sigma) - 1)
+            strays = sigma[second][builder.pairs.images[:, 1]] * builder.pairs.length_s
+            astray = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
+            used = inside & (builder.verdict == IN_USE)
+            return bool(used.any() and astray[used].mean() > FEW_ASTRAY)
+    return False
+
+
+def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tuple[Mask, NDArray[np.intp], float]:
+    """Matches (padded) that agree with the smoothed states, the verdict on each pair, and the scale of a match's
+    sigma: that of their median, the freedom of each pair's pose taken out."""
+    pairs = builder.pairs
+    x0, x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
+    white = np.abs(sampson(there.R, there.t, x0, x1).residual) / builder.sigma
+    use = (white < GATE * scale) & pairs.there
+    verdict = builder.judged(pairs, use, Geometry.of(pairs, there.R).parallax())
+    good = use & (verdict == IN_USE)[:, None]
+    left = int(good.sum()) - POSE_DOF * int((verdict == IN_USE).sum())
+    if left > POSE_DOF:
+        spread = 1.4826 * float(np.median(white[good])) * np.sqrt(good.sum() / left)
+        scale = float(np.clip(spread, *SCALES))
+    return use, verdict, scale
+
+
+def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
+    """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
+    stamps = builder.image_ns
+    place = np.clip(np.searchsorted(estimate.t_ns, stamps - builder.merge_ns), 0, len(estimate.t_ns) - 1)
+    known = np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+    R, p, v, _ = (x[place] for x in estimate.states())
+    pose = np.tile(np.eye(4), (len(place), 1, 1))
+    pose[:, :3, :3], pose[:, :3, 3] = R, p
+    first, second = builder.pairs.images.T
+    data = np.zeros((len(first), COLUMNS))
+    data[:, 1:4], data[:, 4:7] = builder.rate[first], builder.rate[second]
+    states = [pose[first], pose[second]]
+    if builder.rig.timed:
+        states += [v[first], v[second], np.full((len(first), 1), estimate.offset_s("images"))]
+    if builder.rig.boresight:
+        states.append(np.tile(estimate.session_value("camera_boresight_rad", 3), (len(first), 1)))
+    return relative(builder.rig, states, data), known[first] & known[second]
+
+
+def _refusal(verdict: NDArray[np.intp]) -> str:
+    """Why no pair is to be used; empty where they are."""
+    kept, asked = int((verdict == IN_USE).sum()), int(np.isin(verdict, [IN_USE, CONTRARY]).sum())
+    if kept >= LEAST_PAIRS * asked:
+        return ""
+    return (
+        f"coplanarity: refused, only {kept} of {asked} image pairs agree with the solution without images: too "
+        "poor to judge them by; add fixes, control points or standstills"
+    )
