@@ -67,8 +67,11 @@ def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0) ->
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product along the last axis; numpy's own takes five times as long on many rows."""
-    (a0, a1, a2), (b0, b1, b2) = (np.moveaxis(v, -1, 0) for v in (a, b))
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+    a0, a1, a2, b0, b1, b2 = (v[..., k] for v in (a, b) for k in range(3))
+    first = a1 * b2 - a2 * b1
+    out = np.empty((*first.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = first, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    return out
 
 
 def _flat(lines: Floats) -> Floats:
