@@ -121,9 +121,9 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
 
 
 def _of_stack(stack: Stack, estimate: Estimate) -> Part:
-    white, _ = stack.linearize(estimate.values)
-    weight = np.where(stack.used, stack.weight(white), 0.0)
-    return stack.t_ns, stack.blocks[0].sensor, white, weight, stack.used
+    found = stack.measured(estimate.values)
+    weight = np.where(found.used, found.weight, 0.0)
+    return stack.t_ns[found.row], stack.blocks[0].sensor, found.white, weight, found.used
 
 
 def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:

@@ -160,7 +160,7 @@ def _sequential(problem: Problem, windows: Sequence[Window], builders: Sequence[
     """Values to begin from where inertial data alone stray too far for what hangs on images: window by window, as a
     replay has it, the trajectory never leaves what the images hold."""
     smoother = incremental(ReplayConfig(), problem.session.t0_ns)
-    one_pass(smoother, windows, builders, replace(memory, phase="causal"), problem)
+    one_pass(smoother, windows, builders, replace(memory, phase="causal", settled={}), problem)
     return smoother.values()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -178,6 +178,17 @@ class RowModel(Protocol):
         data : (m, q) what each row holds
         """
         ...
+
+
+class Measured(NamedTuple):
+    """What rows consist of, where each stands for many measurements: row (n,) of each, whitened residual (n, d), weight
+    under the loss (n,) and whether it is in use (n,). A `RowModel` of such rows has a method of this name in lower
+    case, with the arguments of `linearize`."""
+
+    row: NDArray[np.intp]
+    white: Floats
+    weight: Floats
+    used: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ them, and none is used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from smartnav_graph.factors.coplanarity import (
     IN_USE,
     OUTSIDE,
     POSE_DOF,
+    REASONS,
     CoplanarityBuilder,
 )
 from smartnav_graph.graph import Builder, Memory
@@ -101,6 +102,35 @@ def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tu
         spread = 1.4826 * float(np.median(white[good])) * np.sqrt(good.sum() / left)
         scale = float(np.clip(spread, *SCALES))
     return use, verdict, scale
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the pairs (by reason, `REASONS`) and of the matches of those in use."""
+
+    pairs: Mapping[str, int]
+    matches: int
+    outliers: int
+    refused: str
+
+    @property
+    def redundancy(self) -> int:
+        """Matches in use beyond what the poses of their pairs take."""
+        return self.matches - self.outliers - POSE_DOF * self.pairs[REASONS[IN_USE]]
+
+
+def account(builders: Iterable[Builder], memory: Memory) -> Account | None:
+    """The account of the image pairs of a run; None where there are none."""
+    for builder in builders:
+        if isinstance(builder, CoplanarityBuilder):
+            verdict = builder.verdict_of(memory)
+            count = np.bincount(verdict, minlength=len(REASONS))
+            inside = verdict[builder.pairs.pair] == IN_USE
+            use = builder.used_matches(memory)
+            refused = builder.refused if memory.settled else ""
+            told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+            return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
+    return None
 
 
 def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:

@@ -51,11 +51,10 @@ def _rows(problem: Problem, estimate: Estimate) -> list[Rejection]:
     told: list[Rejection] = []
     for sensor in sorted({block.sensor for block in estimate.blocks}):
         for stack in estimate.stacks(sensor):
-            white, _ = stack.linearize(estimate.values)
-            size = np.linalg.norm(white, axis=1)
+            size = stack.sizes(estimate.values)
             left_out = ~stack.used
             if stack.loss == "cauchy":
-                left_out |= stack.weight(white) < LEFT_OUT
+                left_out |= stack.weight(size[:, None]) < LEFT_OUT
             told += [
                 _entry(problem, int(stack.t_ns[k]), sensor, int(stack.rows[k]), float(size[k]))
                 for k in np.flatnonzero(left_out)

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from smartnav_graph.assemble import Withheld, used_counts
+from smartnav_graph.factors.coplanarity import CONTRARY, REASONS
 from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
+from smartnav_graph.pair_gate import Account, account
 from smartnav_graph.problem import Problem
 from smartnav_graph.rejections import rejections
 from smartnav_graph.revise import OBSERVED, fix_residuals, position_builders
@@ -64,6 +66,10 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
     total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
     result = {"overall": 2.0 * estimate.cost / total}
     left = float(total)
+    seen = account(problem.builders, memory)
+    if seen is not None and seen.redundancy > 0:
+        left -= seen.redundancy
+        result["coplanarity"] = squares.get("coplanarity", 0.0) / seen.redundancy
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             continue
@@ -118,7 +124,9 @@ def summarise(
     chi2 = _chi2_per_dof(problem, estimate, memory, keyframes)
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
-    warnings = [*problem.warnings, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
+    seen = account(problem.builders, memory)
+    told = [seen.refused] if seen is not None and seen.refused else []
+    warnings = [*problem.warnings, *told, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
     summary: dict[str, Any] = {
         "mode": "batch" if absolute else "dead-reckoning",
         "vehicle": problem.vehicle,
@@ -149,7 +157,8 @@ def summarise(
         "standstills": _standstills(problem),
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used_counts(problem, memory)),
-        "rejected": {name: len(rows) for name, rows in memory.rejected.items()},
+        "rejected": _rejected(memory, seen),
+        **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
         "rejections": rejections(problem, estimate, memory),
         "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
         "position_sigma_m": _sigma_summary(keyframes),
@@ -158,6 +167,14 @@ def summarise(
         "versions": versions(),
     }
     return summary | dict(extra)
+
+
+def _rejected(memory: Memory, seen: Account | None) -> dict[str, int]:
+    """Rows rejected as outliers, by sensor; image pairs that contradict the way, and matches of those that do not."""
+    found = {name: len(rows) for name, rows in memory.rejected.items()}
+    if seen is not None:
+        found |= {"coplanarity": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
+    return found
 
 
 def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, dict[str, Any]]:

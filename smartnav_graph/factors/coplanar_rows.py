@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.factors.observation import exp, right_jacobian, skew, turned
+from smartnav_graph.graph import Measured
 from smartnav_graph.losses import loss_weights
 from smartnav_graph.vision.epipolar import essential, rays, sampson
 from smartnav_graph.vision.pairs import Pairs
@@ -138,17 +139,30 @@ def _between(
     return (R, t), by_first, by_second, by_a
 
 
-class PairRows:
-    """Row model of pairs with every match under a loss of its own. Data: `COLUMNS`.
+class Matched:
+    """Matches of many pairs, of which a row each is made. Data: `COLUMNS`.
 
     sigma : of a match, normalised coordinates; use (n, k) : padded mask of the matches in use, may change until the
     row is added; reach : of the Cauchy loss, in sigmas
     """
 
     def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float) -> None:
-        self.rig, self.sigma, self.use, self.reach = rig, sigma, use, reach
+        self.rig, self.sigma, self.use, self.reach, self.there = rig, sigma, use, reach, pairs.there
         self.letters = rig.letters
         self.x0, self.x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
+
+    def measured(self, states: Sequence[Floats], data: Floats) -> Measured:
+        """The matches of the rows one by one; see `whole_graph.Stack.measured`."""
+        rows = data[:, 0].astype(np.intp)
+        relative_pose = relative(self.rig, states, data)
+        found = sampson(relative_pose.R, relative_pose.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M)
+        white = (found.residual / self.sigma)[self.there[rows]]
+        weight = loss_weights(white**2, "cauchy", self.reach)[0]
+        return Measured(np.nonzero(self.there[rows])[0], white[:, None], weight, self.use[rows][self.there[rows]])
+
+
+class PairRows(Matched):
+    """Row model of pairs with every match under a loss of its own."""
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         """See `graph.RowModel`."""
@@ -162,13 +176,6 @@ class PairRows:
         weighted = (by * weight[..., None]).transpose(0, 2, 1)
         root, residual = _condensed(weighted @ by, (weighted @ white[..., None])[..., 0], 2.0 * cost.sum(axis=1))
         return residual, [root @ jacobian for jacobian in there.by]
-
-    def whitened(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, Floats, Mask]:
-        """Residuals (n, k) of the matches in sigmas, their weights, and which are in use."""
-        rows = data[:, 0].astype(np.intp)
-        there = relative(self.rig, states, data)
-        white = sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M).residual / self.sigma
-        return white, loss_weights(white**2, "cauchy", self.reach)[0], self.use[rows]
 
 
 def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, Floats]:
@@ -185,7 +192,7 @@ def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, F
     return root, residual
 
 
-class CompressedRows:
+class CompressedRows(Matched):
     """Row model of pairs whose inliers are settled: what all matches say of the nine entries of E in nine rows.
 
         W = sum w k k^T / s_0^2 = L L^T,   k = x0~ kron x1~,   r = L^T vec(E) / (sigma sqrt(vec(E)^T N vec(E)))
@@ -196,9 +203,8 @@ class CompressedRows:
     """
 
     def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float, frozen: Relative) -> None:
-        self.rig, self.sigma = rig, sigma
-        self.letters = rig.letters
-        a, b = (rays(np.asarray(pairs.padded(x))) for x in (pairs.x0, pairs.x1))
+        super().__init__(pairs, rig, sigma, use, reach)
+        a, b = rays(self.x0), rays(self.x1)
         E = essential(frozen.R, frozen.t)
         l0, l1 = b @ E.transpose(0, 2, 1), a @ E
         square = (l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + BASELINE_FLOOR_M**2
@@ -218,7 +224,8 @@ class CompressedRows:
         e, by_e = _vectorised(there.R, there.t)
         N, root = self.length[rows], self.root[rows]
         Ne = turned(N, e)
-        s = np.sqrt((e * Ne).sum(axis=1) + self.floor[rows])[:, None]
+        square = (e * Ne).sum(axis=1) + self.floor[rows]  # nothing where no match is in use
+        s = np.sqrt(np.where(square > 0, square, 1.0))[:, None]
         r = turned(root, e) / (self.sigma * s)
         by = root / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
         return r, [by @ by_e @ jacobian for jacobian in there.by]

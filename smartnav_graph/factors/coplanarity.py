@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, PairRows, Relative, Rig
+from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
 from smartnav_graph.factors.gnss import clock_state
 from smartnav_graph.factors.observation import exp
 from smartnav_graph.graph import Block, Memory, RowModel, SessionState, State, Step, Window, key
@@ -83,10 +83,10 @@ IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
 class CoplanarityBuilder:
     """Adds the pairs that end at a keyframe.
 
-    image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; sigma : of a match, normalised
-    rate (k, 3) rad/s : of the body at each image
-    verdict (n,) : what became of each pair, places in `REASONS`; refused : why none is used, in words; frozen :
-    relative poses of the pairs (n) where their inliers were settled
+    image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; rate (k, 3) rad/s : of the body
+    sigma : of a match, normalised
+    verdict (n,) : what became of each pair, places in `REASONS`; at_once (n,) : the same as a replay judged
+    refused : why none is used, in words; frozen : relative poses of the pairs where their inliers were settled
     """
 
     pairs: Pairs
@@ -99,6 +99,7 @@ class CoplanarityBuilder:
     name: str = "coplanarity"
     stage: int = 1
     verdict: NDArray[np.intp] = field(init=False)
+    at_once: NDArray[np.intp] = field(init=False)
     rate: Floats = field(init=False)
     refused: str = ""
     frozen: Relative | None = None
@@ -108,7 +109,7 @@ class CoplanarityBuilder:
     _made: tuple[tuple[object, ...], RowModel] | None = None
 
     def __post_init__(self) -> None:
-        self.verdict = np.full(len(self.pairs), OUTSIDE, dtype=np.intp)
+        self.verdict, self.at_once = (np.full(len(self.pairs), OUTSIDE, dtype=np.intp) for _ in range(2))
         self.rate = np.zeros((len(self.image_ns), 3))
 
     # --- one window ---
@@ -134,11 +135,11 @@ class CoplanarityBuilder:
         model = self._model(memory)
         if memory.phase == "causal":
             self._judge_now(model, ending)
-            ending = ending[self.verdict[ending] == IN_USE]
-        else:
-            ending = ending[memory.used(self.name, ending)]
+        verdict = self.verdict_of(memory)
+        ending = ending[np.isin(verdict[ending], [IN_USE, CONTRARY])]
         if not len(ending):
             return
+        used = tuple((verdict[ending] == IN_USE).tolist())
         states = {state.letter: state for state in self._states()}
         keys, data = [], np.empty((len(ending), COLUMNS))
         for row, pair in enumerate(ending):
@@ -148,7 +149,11 @@ class CoplanarityBuilder:
             of = {"X": own, "V": speed}
             keys.append(tuple(next(of[a]) if a in of else step.use(states[a]) for a in self.rig.letters))
             data[row] = [pair, *self.rate[images].ravel()]
-        step.blocks.append(Block(self.name, model, keys, data, window.t1_ns, rows=tuple(int(k) for k in ending)))
+        step.blocks.append(Block(self.name, model, keys, data, window.t1_ns, rows=tuple(ending.tolist()), used=used))
+
+    def verdict_of(self, memory: Memory) -> NDArray[np.intp]:
+        """What became of each pair (n,) in a pass with this memory."""
+        return self.verdict if memory.settled.get(self.name) else self.at_once
 
     def _begin(self) -> None:
         """Forget the pass before."""
@@ -199,13 +204,19 @@ class CoplanarityBuilder:
 
     # --- which matches ---
 
+    def used_matches(self, memory: Memory) -> Mask:
+        """Mask (m,) of the matches in use in a pass with this memory."""
+        model = self._model(memory)
+        assert isinstance(model, Matched)
+        return np.asarray(self.pairs.flat(model.use), dtype=bool)
+
     def _judge_now(self, model: RowModel, ending: NDArray[np.intp]) -> None:
         """Judge new pairs by the turn since their first image."""
         assert isinstance(model, PairRows)
         C = self.rig.body_R_cam
         turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.pairs.images[ending]]
         some = self.pairs.of(ending)
-        use, self.verdict[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
+        use, self.at_once[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
         model.use[ending, : use.shape[1]] = use
 
     def by_turn(self, pairs: Pairs, R: Floats) -> tuple[Mask, NDArray[np.intp]]:

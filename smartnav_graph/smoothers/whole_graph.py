@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.graph import STATES, Block, RowModel, SessionState, Step
+from smartnav_graph.graph import STATES, Block, Measured, RowModel, SessionState, Step
 from smartnav_graph.losses import loss_weights, robust
 
 Floats = NDArray[np.float64]
@@ -71,9 +71,29 @@ class Stack:
 
         values : gtsam.Values, or a `Snapshot` that stacks share
         """
+        return self.model.linearize(self._states(values), self.data)
+
+    def _states(self, values: Any) -> list[Floats]:
+        """The states (m, ...) of the rows, one array a letter of the model."""
         snapshot = values if isinstance(values, Snapshot) else Snapshot(values, self.held)
         columns = zip(self.model.letters, zip(*self.keys, strict=True), strict=True)
-        return self.model.linearize([snapshot.column(letter, names) for letter, names in columns], self.data)
+        return [snapshot.column(letter, names) for letter, names in columns]
+
+    def measured(self, values: Any) -> Measured:
+        """Every measurement by itself: the rows, or what they stand for."""
+        if hasattr(self.model, "measured"):
+            found: Measured = self.model.measured(self._states(values), self.data)
+            return found._replace(used=found.used & self.used[found.row])
+        white, _ = self.linearize(values)
+        return Measured(np.arange(len(white)), white, np.where(self.used, self.weight(white), 0.0), self.used)
+
+    def sizes(self, values: Any) -> Floats:
+        """Norm (m,) of each whitened row; of one that stands for many measurements, their median."""
+        found = self.measured(values)
+        norm = np.linalg.norm(found.white, axis=1)
+        if len(norm) == len(self.keys):
+            return np.asarray(norm)
+        return np.array([np.median(norm[found.row == row]) for row in range(len(self.keys))])
 
     def cost(self, values: Any) -> float:
         """Half the sum of squares of the used rows, under the loss."""
