@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "info": ("sessions", "Info", "what a session holds, what is missing, what looks wrong"),
     "simulate": ("sessions", "Simulate", "a named simulated session with its truth"),
     "degrade": ("sessions", "DegradeSession", "a session -> a noisier, faulty one"),
+    "match": ("match", "Match", "the pictures of a session -> matched points or tracks; or how good features are"),
     "smooth": ("runs", "Smooth", "a session -> a run: the smoothed trajectory with its covariance"),
     "replay": ("runs", "Replay", "the same one window at a time, causal"),
     "evaluate": ("scores", "Evaluate", "a run against a reference"),

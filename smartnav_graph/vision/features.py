@@ -41,9 +41,10 @@ def _freak(cv2: Any) -> Any:
     return cv2.xfeatures2d.FREAK_create()
 
 
-# Thresholds are low: the strongest points are taken, however weak the texture is.
+# Thresholds are low: the strongest points are taken, however weak the texture is. ORB places its points on whole pixels
+# of each level of its pyramid: beyond a scale of two (five levels) they would be too coarse for relative geometry.
 KINDS: dict[str, Kind] = {
-    "orb": Kind(lambda cv2, n: cv2.ORB_create(nfeatures=n, fastThreshold=10), at_once=True),
+    "orb": Kind(lambda cv2, n: cv2.ORB_create(nfeatures=n, fastThreshold=10, nlevels=5), at_once=True),
     "sift": Kind(lambda cv2, n: cv2.SIFT_create(nfeatures=n, contrastThreshold=0.02), at_once=True),
     "akaze": Kind(lambda cv2, n: cv2.AKAZE_create(threshold=5e-4)),
     "brisk": Kind(lambda cv2, n: cv2.BRISK_create(thresh=20)),

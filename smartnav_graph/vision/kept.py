@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -84,12 +84,17 @@ def _kept(folder: Path, name: str, wanted: Mapping[str, Any]) -> dict[str, Any]:
         raise SessionError(file, "does not tell what it was made of", SAME, REMEDY, stream=name) from error
     if rows != _digest(file):
         raise SessionError(file, "was changed since it was made", SAME, REMEDY, stream=name)
-    other = {key: value for key, value in wanted.items() if before.get(key) != value}
+    other = [key for key, value in wanted.items() if before.get(key) != value]
     if other:
-        texts = {key: f"{key} {before.get(key)} (asked for: {value})" for key, value in other.items()}
-        texts |= {"inputs": "other pictures or another calibration"} if "inputs" in other else {}
-        raise SessionError(file, f"was made with {', '.join(texts.values())}", SAME, REMEDY, stream=name)
+        raise SessionError(file, _difference(before, wanted, other), SAME, REMEDY, stream=name)
     return dict(report)
+
+
+def _difference(before: Mapping[str, Any], wanted: Mapping[str, Any], keys: Sequence[str]) -> str:
+    if "from_file" in before:
+        return f"was taken from {before['from_file']}"
+    texts = [f"{key} {before.get(key)} (asked for: {wanted[key]})" for key in keys if key != "inputs"]
+    return f"was made with {', '.join(texts) or 'other pictures or another calibration'}"
 
 
 def _inputs(session: Session, config: FrontEndConfig, workers: int) -> str:

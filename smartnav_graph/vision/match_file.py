@@ -132,6 +132,11 @@ def to_matches(
     return matches, int((~good).sum())
 
 
+def of_images(matches: Matches, image_ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which matches (n,) are between two of these images."""
+    return np.isin(matches.image_id_0, image_ids) & np.isin(matches.image_id_1, image_ids)
+
+
 def write(
     matches: Matches, path: str | Path, camera: Camera, *, sensor: Sensor | None = None, force: bool = False
 ) -> None:

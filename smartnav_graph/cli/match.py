@@ -1,0 +1,181 @@
+"""Matched points of pictures on the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from smartnav_graph import readers
+from smartnav_graph import session as session_model
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names, progress
+from smartnav_graph.errors import CalibrationError, ConfigError, SessionError
+from smartnav_graph.run_folder import plain
+from smartnav_graph.session import Session
+from smartnav_graph.vision import benchmark as scores
+from smartnav_graph.vision import features as kinds
+from smartnav_graph.vision import kept, match_file
+from smartnav_graph.vision.benchmark import Published, Score
+from smartnav_graph.vision.front_end import FrontEndConfig
+
+FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Match(Command):
+    """Matched points, or tracks, of a session's pictures; they are kept in the session, and read again by a second
+    call with the same options.
+
+    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells.
+
+    Example: smartnav match lund --features sift
+    """
+
+    session: SourceName
+    """Session folder; with --benchmark also a log of a known format."""
+    features: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
+    """orb (default), sift, akaze, brisk, fast+freak, star+brief, gftt+freak, mser+freak, or klt for tracks; with
+    --benchmark several, separated by commas, all that the installed OpenCV has by default."""
+    policy: Literal["ratio", "thesis"] = "ratio"
+    """Which neighbours match: mutual and by Lowe's ratio, or the 15 best as in the thesis of 2012."""
+    count: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Points of a picture at most; 0 is 1500, or 300 tracks."""
+    spans: Annotated[Text, tyro.conf.arg(metavar="N,N,...")] = None
+    """Pictures between the two of a pair; by default 1,2,4,8, with --benchmark 1."""
+    longest: Annotated[float, tyro.conf.arg(metavar="S")] = 2.0
+    """Longest time between the two of a pair that are not neighbours."""
+    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
+    """Pictures a second at most, 0 for all; by default 4, for tracks and with --benchmark all."""
+    benchmark: Switch = False
+    """True matches, useful pairs and times, beside those of the thesis."""
+    from_file: FilePath = None
+    """Take the matches of this match file of 2012 instead of finding some."""
+    to_file: FilePath = None
+    """Write the session's matches as a match file of 2012 instead of finding some."""
+    camera: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
+    """The camera that a match file speaks of, where the session has several."""
+    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Pictures at once; 0 for as many as there are processors."""
+    force: Switch = False
+    """Replace what is there."""
+    json: Switch = False
+    """Print JSON, and nothing else, on stdout."""
+
+    def run(self) -> None:
+        if self.from_file is not None and self.to_file is not None:
+            raise ConfigError("--to-file", "is given with --from-file", "one of them", "call twice")
+        if self.benchmark:
+            self._benchmark()
+        elif self.from_file is not None:
+            self._from_file(self.from_file)
+        elif self.to_file is not None:
+            self._to_file(self.to_file)
+        else:
+            self._match()
+
+    def _match(self) -> None:
+        config = self._config(self.features or "orb", "1,2,4,8", self.rate)
+        with progress(self.quiet) as show:
+            found = kept.match(self.session, config, force=self.force, workers=self.workers, progress=show)
+        if self.json:
+            self._print_json({"computed": found.computed} | asdict(found.report))
+            return
+        print(found.report.to_text())
+        name = "tracks" if config.tracks else "matches"
+        print(f"{name}: {Path(self.session) / name}.parquet{'' if found.computed else ', kept from before'}")
+
+    def _benchmark(self) -> None:
+        asked = names(self.features) or tuple(kinds.available())
+        config = self._config(asked[0], "1", self.rate or 0.0)
+        session = readers.load(self.session)
+        with progress(self.quiet) as show:
+            found = scores.compare(session, asked, config, workers=self.workers, progress=show)
+        if self.json:
+            self._print_json([one.to_dict() for one in found])
+        else:
+            print_scores(found, all_known=self.features is None)
+
+    def _from_file(self, path: Path) -> None:
+        folder = Path(self.session)
+        session = session_model.load(folder)
+        kept.refuse_others(folder, "matches", self.force)
+        name, camera = self._one_camera(session)
+        rows = match_file.read(path)
+        assert session.images is not None  # the camera took some
+        matches, lost = match_file.to_matches(rows, session.images, name, camera)
+        report = {"from_file": str(path), "rows": len(rows.t0_ns), "matches": len(matches), "rows_without_images": lost}
+        kept.keep(folder, matches, {"from_file": path.name, "camera": name}, report)
+        if self.json:
+            self._print_json(report)
+            return
+        print(f"{path}: {len(rows.t0_ns)} rows, {len(matches)} matches, {lost} rows without two images")
+        print(f"matches: {folder / 'matches.parquet'}")
+
+    def _to_file(self, path: Path) -> None:
+        session = session_model.load(self.session)
+        name, camera = self._one_camera(session)
+        if session.images is None or session.matches is None:
+            raise SessionError(self.session, "has no matches", "matches.parquet", "make them with `smartnav match`")
+        mine = session.images.image_id[session.images.camera == name]
+        matches = session.matches.take(match_file.of_images(session.matches, mine))
+        match_file.write(matches, path, camera, force=self.force)
+        if self.json:
+            self._print_json({"to_file": str(path), "matches": len(matches)})
+        else:
+            print(f"{path}: {len(matches)} matches of {name}")
+
+    def _one_camera(self, session: Session) -> tuple[str, Camera]:
+        """The camera named, or the only one that took images."""
+        there = [] if session.images is None else sorted(set(session.images.camera))
+        cameras = {} if session.calibration is None else session.calibration.cameras
+        name = self.camera or (there[0] if len(there) == 1 else "")
+        if name not in there:
+            raise ConfigError("--camera", repr(name), f"one that took images: {', '.join(there) or 'there is none'}")
+        if name not in cameras:
+            where = Path(self.session) / "calibration.toml"
+            raise CalibrationError(where, f"knows no camera {name}", f"[cameras.{name}]", "add fx, fy, cx, cy")
+        return name, cameras[name]
+
+    def _config(self, features: str, spans: str, rate_hz: float | None) -> FrontEndConfig:
+        text = self.spans or spans
+        try:
+            numbers = tuple(int(part) for part in names(text))
+        except ValueError as error:
+            raise ConfigError("--spans", repr(text), "whole numbers separated by commas, as 1,2,4") from error
+        return FrontEndConfig(features, self.policy, self.count, 0.8, numbers, self.longest, rate_hz)
+
+    def _print_json(self, value: Any) -> None:
+        print(json.dumps(plain(value), allow_nan=False))
+
+
+def print_scores(found: Sequence[Score], *, all_known: bool) -> None:
+    """A table for people: ours, and what the thesis published; kinds that this build lacks only with the latter."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"policy {found[0].policy}, {found[0].pairs} pairs", title_justify="left")
+    table.add_column("features")
+    for heading in ("true", ">= 5 true", "matches", "ms a picture", "ms a pair", "thesis true", ">= 5 true", "s"):
+        table.add_column(heading, justify="right")
+    for one in found:
+        ours = (f"{one.true_rate:.2%}", f"{one.useful_pairs:.2%}", f"{one.median_matches:g}")
+        times = (f"{one.ms_picture:.1f}", f"{one.ms_pair:.1f}")
+        table.add_row(one.features, *ours, *times, *_published(scores.THESIS.get(one.features)))
+    for name in [name for name in kinds.KINDS if all_known and name not in {one.features for one in found}]:
+        table.add_row(name, *["-"] * 5, *_published(scores.THESIS.get(name)))
+    Console(width=120).print(table)
+    if len(table.rows) > len(found):
+        print("-: not in the installed build of OpenCV (see scripts/reproduce_features)")
+    if found[0].skipped:
+        print("skipped: " + ", ".join(f"{n} {reason}" for reason, n in found[0].skipped.items()))
+    if found[0].unscored_pairs or found[0].rotation_pairs:
+        print(f"pairs without a reference: {found[0].unscored_pairs}; by rotation alone: {found[0].rotation_pairs}")
+
+
+def _published(row: Published | None) -> tuple[str, ...]:
+    return ("", "", "") if row is None else (f"{row.true_rate:.2%}", f"{row.useful_pairs:.2%}", f"{row.seconds:g}")

@@ -1,0 +1,225 @@
+"""How good features are, over a session whose camera poses are known: the table of the SmartNav thesis, and ours.
+
+A match is true when it misses the epipolar geometry of the reference by at most `TOLERANCE_PX` (Sampson distance).
+Where the baseline is so short that a point `DEPTH_M` away would hardly move, that test accepts anything along a line of
+no meaning: there the match must lie where the rotation alone puts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.session import Session
+from smartnav_graph.streams import Matches, Reference
+from smartnav_graph.timebase import NS, interpolate, seconds_since
+from smartnav_graph.vision.epipolar import rays, sampson
+from smartnav_graph.vision.front_end import FrontEndConfig, Progress, find
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TOLERANCE_PX = 1.5
+DEPTH_M = 3.0
+# True matches that make a pair useful.
+USEFUL = 5
+
+
+class Published(NamedTuple):
+    """A row of the thesis' table: share of true matches, share of pairs with at least five, seconds."""
+
+    true_rate: float
+    useful_pairs: float
+    seconds: float
+
+
+THESIS = {
+    "fast+freak": Published(0.6864, 0.9444, 0.6),
+    "star+brief": Published(0.9782, 0.4444, 0.3),
+    "gftt+freak": Published(0.7120, 0.9444, 0.7),
+    "orb": Published(0.8499, 0.6111, 1.0),
+    "brisk": Published(0.5383, 0.9444, 3.3),
+    "mser+freak": Published(0.8469, 0.5556, 0.7),
+}
+
+
+@dataclass(frozen=True)
+class Score:
+    """One kind of features on one session.
+
+    pairs : with a reference, of them unscored_pairs without; rotation_pairs : scored by rotation alone
+    true_rate : true matches of all; useful_pairs : share of pairs with at least five true matches
+    median_matches, median_true : of a pair; ms_picture, ms_pair : processor time
+    """
+
+    features: str
+    policy: str
+    pairs: int
+    unscored_pairs: int
+    rotation_pairs: int
+    matches: int
+    true_rate: float
+    useful_pairs: float
+    median_matches: float
+    median_true: float
+    ms_picture: float
+    ms_pair: float
+    skipped: Mapping[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, the thesis' row beside them."""
+        published = THESIS.get(self.features)
+        return asdict(self) | {"thesis": None if published is None else published._asdict()}
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """Poses of the cameras at times: nav_R_cam (n, 3, 3), nav_t_cam (n, 3), and which are `known` (n,)."""
+
+    nav_R_cam: Floats
+    nav_t_cam: Floats
+    known: Mask
+
+    @classmethod
+    def at(cls, session: Session, camera: str, t_ns: NDArray[np.int64]) -> CameraPoses:
+        """Of the reference, the camera's mount and its clock.
+
+        Raises
+        ------
+        SessionError
+            No reference, or none with attitude.
+        """
+        reference = session.reference
+        if reference is None or reference.quat is None or len(reference) < 2:
+            where, remedy = session.path or "session", "import a log with poses"
+            raise SessionError(where, "has no reference with attitude", "reference.parquet with qw, qx, qy, qz", remedy)
+        offset = 0 if session.calibration is None else session.calibration.cameras[camera].time_offset_s
+        times = np.asarray(t_ns + round(offset * NS), dtype=np.int64)
+        known = (times >= reference.t_ns[0]) & (times <= reference.t_ns[-1])
+        R, t = _poses(reference, np.clip(times, reference.t_ns[0], reference.t_ns[-1]))
+        mount = session.mount(camera)
+        return cls(R @ np.array(mount.body_R), t + R @ np.array(mount.body_t), known)
+
+    def relative(self, first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """c0_R_c1 (m, 3, 3) and c0_t_c1 (m, 3) of pairs of rows."""
+        back = self.nav_R_cam[first].transpose(0, 2, 1)
+        apart = self.nav_t_cam[second] - self.nav_t_cam[first]
+        return back @ self.nav_R_cam[second], np.einsum("nij,nj->ni", back, apart)
+
+
+def _poses(reference: Reference, t_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    assert reference.quat is not None
+    seconds = seconds_since(reference.t_ns, int(reference.t_ns[0]))
+    turn = Slerp(seconds, Rotation.from_quat(reference.quat[:, [1, 2, 3, 0]]))
+    at = np.clip(seconds_since(t_ns, int(reference.t_ns[0])), 0.0, seconds[-1])
+    return turn(at).as_matrix(), interpolate(t_ns, reference.t_ns, reference.enu)
+
+
+def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) -> tuple[Mask, Mask]:
+    """Which matches agree with known poses, and which of them were judged by the rotation alone.
+
+    Parameters
+    ----------
+    R (m, 3, 3), t (m, 3) m : c0_R_c1, c0_t_c1 of each match; x0, x1 (m, 2) undistorted normalised
+    focal_px : pixels a unit of these
+    """
+    weak = np.linalg.norm(t, axis=1) * focal_px / DEPTH_M < TOLERANCE_PX
+    safe = np.where(weak[:, None], [0.0, 0.0, 1.0], t)
+    epipolar = np.abs(sampson(R, safe, x0[:, None], x1[:, None]).residual[:, 0])
+    ahead = np.einsum("nij,nj->ni", R, rays(x1))
+    moved = ahead[:, :2] / np.where(np.abs(ahead[:, 2:]) > 1e-9, ahead[:, 2:], np.nan)
+    turned = np.linalg.norm(moved - x0, axis=1)
+    return np.where(weak, turned, epipolar) * focal_px <= TOLERANCE_PX, weak
+
+
+def score(session: Session, config: FrontEndConfig, *, workers: int = 0, progress: Progress | None = None) -> Score:
+    """Match the session's pictures and compare with its reference.
+
+    Raises
+    ------
+    ConfigError
+        Tracks are asked for.
+    SessionError
+        As `CameraPoses.at` and `front_end.find`; or no pair has a reference.
+    """
+    if config.tracks:
+        raise ConfigError("--features", f"{config.features} in a benchmark of descriptors", "detector and descriptor")
+    CameraPoses.at(session, *_any_camera(session))  # before the work is done
+    found = find(session, config, workers=workers, progress=progress)
+    assert found.matches is not None
+    good, weak, known = _judged(session, found.matches)
+    pair = _pair_numbers(found.matches)
+    scored = np.unique(pair[known])
+    if not len(scored):
+        where = session.path or "session"
+        raise SessionError(where, "no pair of pictures has a reference", "poses at the times of the pictures")
+    total = np.bincount(pair[known])[scored]
+    true = np.bincount(pair[known], weights=good[known])[scored]
+    report = found.report
+    return Score(
+        features=config.features,
+        policy=config.policy,
+        pairs=len(scored) + report.empty_pairs,
+        unscored_pairs=len(np.unique(pair)) - len(scored),
+        rotation_pairs=len(np.unique(pair[known & weak])),
+        matches=int(known.sum()),
+        true_rate=float(true.sum() / total.sum()),
+        useful_pairs=float((true >= USEFUL).sum() / (len(scored) + report.empty_pairs)),
+        median_matches=float(np.median([*total, *[0] * report.empty_pairs])),
+        median_true=float(np.median([*true, *[0] * report.empty_pairs])),
+        ms_picture=report.ms_picture,
+        ms_pair=report.ms_pair,
+        skipped=dict(report.skipped),
+    )
+
+
+def _any_camera(session: Session) -> tuple[str, NDArray[np.int64]]:
+    if session.images is None or not len(session.images):
+        raise SessionError(session.path or "session", "has no images", "images.parquet with pictures")
+    cameras: Mapping[str, Camera] = {} if session.calibration is None else session.calibration.cameras
+    there = [name for name in sorted(set(session.images.camera)) if name in cameras]
+    if not there:
+        remedy = "add [cameras] to calibration.toml"
+        raise SessionError(session.path or "session", "no calibrated camera took its images", "one", remedy)
+    return there[0], session.images.t_ns[:1]
+
+
+def _judged(session: Session, matches: Matches) -> tuple[Mask, Mask, Mask]:
+    """Masks (m,): true, judged by rotation alone, with a reference."""
+    assert session.images is not None and session.calibration is not None
+    names = dict(zip(session.images.image_id.tolist(), session.images.camera.tolist(), strict=True))
+    camera = np.array([names[i] for i in matches.image_id_0.tolist()], dtype=object)
+    good, weak, known = (np.zeros(len(matches), dtype=bool) for _ in range(3))
+    for name in sorted(set(camera)):
+        rows = np.flatnonzero(camera == name)
+        poses = CameraPoses.at(session, name, np.concatenate([matches.t_ns[rows], matches.t_1_ns[rows]]))
+        first = np.arange(len(rows))
+        R, t = poses.relative(first, first + len(rows))
+        focal = session.calibration.cameras[name].focal
+        good[rows], weak[rows] = true_matches(R, t, matches.xy0_n[rows], matches.xy1_n[rows], focal)
+        known[rows] = poses.known[: len(rows)] & poses.known[len(rows) :]
+    return good, weak, known
+
+
+def _pair_numbers(matches: Matches) -> NDArray[np.intp]:
+    both = np.stack([matches.image_id_0, matches.image_id_1], axis=1)
+    return np.asarray(np.unique(both, axis=0, return_inverse=True)[1]).ravel()
+
+
+def compare(
+    session: Session,
+    names: Sequence[str],
+    config: FrontEndConfig,
+    *,
+    workers: int = 0,
+    progress: Progress | None = None,
+) -> list[Score]:
+    """`score` of several kinds of features, otherwise alike."""
+    return [score(session, replace(config, features=name), workers=workers, progress=progress) for name in names]
