@@ -69,7 +69,8 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
     seen = account(problem.builders, memory)
     if seen is not None and seen.redundancy > 0:
         left -= seen.redundancy
-        result["coplanarity"] = squares.get("coplanarity", 0.0) / seen.redundancy
+        inside = rows.get("coplanarity", np.zeros(0, dtype=bool))  # within their gate; the loss would make it too small
+        result["coplanarity"] = float((solution.residuals.whitened[inside] ** 2).sum()) / seen.redundancy
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             continue
