@@ -182,7 +182,7 @@ def test_demo_leaves_what_it_says_and_runs_again(call, tmp_path):
     for _ in range(2):
         code, out, _ = call(f"demo --out {tmp_path}/demo --quiet")
         assert code == 0 and "withheld gnss: 423 rows" in out
-        for name in ("kitti-run/report.html", "kitti-run/run.rrd", "euroc.rrd", "euroc/tracks.parquet"):
+        for name in ("kitti-run/report.html", "kitti-run/run.rrd", "euroc-run/report.html", "euroc/tracks.parquet"):
             assert (tmp_path / "demo" / name).stat().st_size > 0
 
 
