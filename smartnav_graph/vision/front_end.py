@@ -269,7 +269,7 @@ class _Job:
         )
 
     def _nothing(self, found: str) -> SessionError:
-        told = f"{found} of {len(self.chosen)}; skipped: {self._report().left_out}"
+        told = f"{found} of {len(self.listed)}; skipped: {self._report().left_out}"
         remedy = "give sharp pictures with texture, and [cameras] in calibration.toml"
         return SessionError(self.session.path or "session", told, "pictures of a calibrated camera", remedy)
 
