@@ -1,0 +1,54 @@
+"""What the rays of two cameras say once the rotation is taken out: parallax, and which of the matches lie in front.
+
+Source: Hartley, Zisserman (2004), Multiple View Geometry, 9.6.2 (the four poses of one essential matrix).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.vision.epipolar import cross, rays
+from smartnav_graph.vision.refine import Matched
+
+Floats = NDArray[np.float64]
+
+CLEAR = 3.0  # sigmas of parallax from which on front and behind are certain
+ALIKE = 0.1  # of the matches: below that difference of votes two poses lie equally well in front
+
+
+def parallax(matched: Matched, R: Floats) -> Floats:
+    """Angle (m,) rad between the rays of each match, turned into the same axes."""
+    a, y = rays(matched.xy0), rays(matched.xy1) @ R.T
+    return np.asarray(np.arctan2(np.linalg.norm(cross(a, y), axis=1), np.einsum("mi,mi->m", a, y)))
+
+
+def in_front(matched: Matched, R: Floats, t: Floats) -> Floats:
+    """Vote (m,) of every match: 1 in front of both cameras, -1 behind one, nearer to 0 the less parallax it has.
+
+    Depths a, b of x0~ a = y b + t with y = R x1~ and n = x0~ x y: a = (t x y) . n / n^2, b = (t x x0~) . n / n^2.
+    """
+    a, y = rays(matched.xy0), rays(matched.xy1) @ R.T
+    n = cross(a, y)
+    first = (cross(t, y) * n).sum(axis=1)
+    second = (cross(t, a) * n).sum(axis=1)
+    sine = np.sqrt((n * n).sum(axis=1) / ((a * a).sum(axis=1) * (y * y).sum(axis=1)))
+    weight = np.minimum(sine / (CLEAR * matched.sigma), 1.0)
+    return np.asarray(np.where((first > 0) & (second > 0), weight, -weight))
+
+
+def faced(matched: Matched, R: Floats, t: Floats, *, known_rotation: bool) -> tuple[Floats, Floats]:
+    """Of the four poses of one essential matrix the one with the scene in front: c0_R_c1, c0_t_c1.
+
+    Where two do alike the smaller rotation is taken: without parallax the twin, half a turn round the baseline, cannot
+    be told by the matches. A rotation known beforehand has no twin.
+    """
+    twin = np.asarray(Rotation.from_rotvec(np.pi * t).as_matrix() @ R)
+    turns = [R] if known_rotation else [R, twin]
+    poses = [(turn, side * t) for turn in turns for side in (1.0, -1.0)]
+    votes = [float(in_front(matched, *pose).sum()) for pose in poses]
+    least = max(votes) - ALIKE * len(matched.sigma)
+    angles = [float(Rotation.from_matrix(pose[0]).magnitude()) for pose in poses]
+    best = min(range(len(poses)), key=lambda k: (votes[k] < least, round(angles[k], 9), -votes[k]))
+    return poses[best]

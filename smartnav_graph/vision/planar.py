@@ -1,0 +1,103 @@
+"""The pose of two cameras that look at a plane: there coplanarity alone says little, the homography much.
+
+    x0 ~ H x1,  H = R + t m^T,  m . X1 = 1 on the plane (unit t: lengths in units of the baseline)
+
+Source: Faugeras, Lustman (1988), Motion and structure from motion in a piecewise planar environment (through OpenCV's
+decomposition); Malis, Vargas (2007), INRIA RR-6303, for the two poses that remain.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.vision.consensus_pair import pixels_a_unit, usac
+from smartnav_graph.vision.epipolar import rays
+from smartnav_graph.vision.refine import (
+    GATE_SQUARE,
+    REACH,
+    Epipolar,
+    Fit,
+    Matched,
+    Plane,
+    RotationPrior,
+    minimise,
+    transfer,
+)
+
+Floats = NDArray[np.float64]
+
+LEAST_PLANAR = 6  # matches: eight unknowns and four to judge them by
+ROUGHLY = 2.0  # times the gate, before the pose is refined
+LEAST_SHARE_OF_PLANE = 0.6  # of the coplanar matches: with fewer on it no plane explains more than depth does
+CLEARLY_BETTER = 9.0  # difference of squared misses, 3 sigmas
+
+
+class PlanarFit(NamedTuple):
+    """Pose with its plane; `twin`: another pose explains the plane and all the rest as well."""
+
+    fit: Fit
+    twin: bool
+
+
+def fit_plane(
+    matched: Matched, coplanar: NDArray[np.bool_], prior: RotationPrior | None, seed: int
+) -> PlanarFit | None:
+    """The pose (R, t, m) of a plane that most of the `coplanar` (m,) matches show; None where there is none."""
+    H = _homography(matched, seed)
+    if H is None:
+        return None
+    miss, _ = transfer(H, matched)
+    near = np.einsum("mk,mk->m", miss, miss) < ROUGHLY**2 * GATE_SQUARE[2]
+    if near[coplanar].sum() < LEAST_SHARE_OF_PLANE * coplanar.sum():
+        return None
+    fits = [minimise(Plane(matched), start, reach=REACH, prior=prior) for start in _poses(H, matched)]
+    return _chosen(fits, matched) if fits else None
+
+
+def _homography(matched: Matched, seed: int) -> Floats | None:
+    """H (3, 3) from the second image to the first, by OpenCV's MAGSAC++."""
+    import cv2
+
+    if len(matched.sigma) < LEAST_PLANAR:
+        return None
+    focal = pixels_a_unit(matched)
+    H, _ = cv2.findHomography(focal * matched.xy1, focal * matched.xy0, usac(seed))
+    if H is None or not np.isfinite(H).all():
+        return None
+    K = np.array([focal, focal, 1.0])
+    return np.asarray(H * K / K[:, None])
+
+
+def _poses(H: Floats, matched: Matched) -> list[tuple[Floats, Floats, Floats]]:
+    """States (R, t, m) of H whose plane lies in front of the second camera for most of the matches on it."""
+    import cv2
+
+    miss, _ = transfer(H, matched)
+    on_it = matched.only((miss**2).sum(axis=1) < GATE_SQUARE[2])
+    found = []
+    _, turns, shifts, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    for R, shift, normal in zip(turns, shifts, normals, strict=True):
+        length = float(np.linalg.norm(shift))
+        if length > 0 and np.mean(rays(on_it.xy1) @ normal.ravel() > 0) > 0.5:
+            found.append((np.asarray(R), shift.ravel() / length, length * normal.ravel()))
+    return found
+
+
+def _chosen(fits: list[Fit], matched: Matched) -> PlanarFit:
+    """Of the poses of a plane the one that what lies off the plane, or the prior, speaks for; else the smaller turn."""
+    costs = [2.0 * fit.cost + _off_plane(fit, matched) for fit in fits]
+    alike = [fit for fit, cost in zip(fits, costs, strict=True) if cost < min(costs) + CLEARLY_BETTER]
+    turns = [Rotation.from_matrix(fit.state[0]) for fit in alike]
+    best = int(np.argmin([turn.magnitude() for turn in turns]))
+    twin = any((turns[best].inv() * turn).magnitude() > 1e-3 for turn in turns)
+    return PlanarFit(alike[best], twin)
+
+
+def _off_plane(fit: Fit, matched: Matched) -> float:
+    """Truncated squared miss of coplanarity of the matches off the plane."""
+    r, _ = Epipolar(matched).rows(fit.state[:2])
+    return float(np.minimum(r[:, 0] ** 2, GATE_SQUARE[1])[fit.square > GATE_SQUARE[2]].sum())

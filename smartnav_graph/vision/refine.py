@@ -1,0 +1,251 @@
+"""The relative pose that fits matched points best: Levenberg-Marquardt with a loss per match, on three models.
+
+A model tells, of a state whose first element is c0_R_c1 and of m matches, k whitened residuals a match:
+
+    Epipolar   (R, t)      k = 1, coplanarity (Sampson), 5 unknowns: rotation, direction of t
+    Turn       (R,)        k = 2, point transfer without a baseline, 3 unknowns: rotation
+    Plane      (R, t, m)   k = 2, point transfer by a plane m . X1 = 1, 8 unknowns: rotation, direction, plane
+
+Rotations change on the right, R <- R Exp(w); directions on the sphere, t <- unit(t + B d) with B = `tangent_basis(t)`.
+Point transfer x0 = h(x1) is weighed with the noise of both images, S = sigma^2 (I + A A^T), A = dh / dx1.
+
+Source: Hartley, Zisserman (2004), Multiple View Geometry, 4.2 and 11.4; Marquardt (1963); Geman, McClure (1987) for the
+loss e^2 / (1 + e^2 / c^2), which unlike Cauchy's lets wrong matches cost no more the farther off they are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.vision.epipolar import cross, rays, sampson
+
+Floats = NDArray[np.float64]
+State = tuple[Floats, ...]
+
+REACH = 3.0  # of the loss while inliers are still looked for, in sigmas
+GATE = 3.0  # sigmas a match on a line may miss
+GATE_SQUARE = {1: GATE**2, 2: 11.83}  # squared misses that good matches exceed as seldom, by the number of residuals
+ITERATIONS = 30
+SMALL_STEP, ROUGH_STEP = 1e-3, 0.05  # squared, in units of its covariance: at last, and while inliers are looked for
+SEED_DAMPING = 1e-4
+
+
+@dataclass(frozen=True)
+class RotationPrior:
+    """What a gyro tells: c0_R_c1 (3, 3), the second camera's axes in the first one's, and its sigma, rad an axis."""
+
+    c0_R_c1: Floats
+    sigma: float
+
+    def __post_init__(self) -> None:
+        R = np.asarray(self.c0_R_c1, dtype=np.float64)
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ConfigError("rotation prior", "c0_R_c1 is no rotation", "a (3, 3) rotation matrix")
+        if not 0 < self.sigma < np.inf:
+            raise ConfigError("rotation prior", f"sigma = {self.sigma} rad", "> 0 and finite", "leave the prior out")
+
+    def deviation(self, R: Floats) -> Floats:
+        """Turn (3,) in sigmas from the prior to R, right side."""
+        return np.asarray(Rotation.from_matrix(self.c0_R_c1.T @ R).as_rotvec() / self.sigma)
+
+
+class Model(Protocol):
+    """Whitened residuals (m, k) with their derivatives (m, k, p), and the state moved by a step (p,)."""
+
+    def rows(self, state: State) -> tuple[Floats, Floats]: ...
+
+    def moved(self, state: State, step: Floats) -> State: ...
+
+
+class Matched(NamedTuple):
+    """Matches: undistorted normalised points (m, 2) of both images and their sigma (m,)."""
+
+    xy0: Floats
+    xy1: Floats
+    sigma: Floats
+
+    def only(self, rows: NDArray[np.bool_]) -> Matched:
+        """Some of them."""
+        return Matched(self.xy0[rows], self.xy1[rows], self.sigma[rows])
+
+
+def tangent_basis(t: Floats) -> Floats:
+    """B (3, 2): unit columns u, v across the unit vector t; u = unit(t x e), e the axis t leans on least, v = t x u."""
+    x, y, z = t
+    k = int(np.argmin(np.abs(t)))
+    u = np.array([(0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0)][k]) / math.hypot(*np.delete(t, k))
+    v = (y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0])
+    return np.array([u, v]).T
+
+
+def turned(R: Floats, w: Floats) -> Floats:
+    """R Exp(w)."""
+    return np.asarray(R @ Rotation.from_rotvec(w).as_matrix())
+
+
+def shifted(t: Floats, d: Floats) -> Floats:
+    """unit(t + B d)."""
+    moved = t + tangent_basis(t) @ d
+    return np.asarray(moved / np.linalg.norm(moved))
+
+
+@dataclass(frozen=True)
+class Epipolar:
+    """Coplanarity."""
+
+    matched: Matched
+
+    def rows(self, state: State) -> tuple[Floats, Floats]:
+        R, t = state
+        r, by_turn, by_t = sampson(R, t, self.matched.xy0, self.matched.xy1)
+        by_state = np.concatenate([by_turn, by_t @ tangent_basis(t)], axis=1)
+        return (r / self.matched.sigma)[:, None], (by_state / self.matched.sigma[:, None])[:, None]
+
+    def moved(self, state: State, step: Floats) -> State:
+        return turned(state[0], step[:3]), shifted(state[1], step[3:5])
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Point transfer by a rotation alone."""
+
+    matched: Matched
+
+    def rows(self, state: State) -> tuple[Floats, Floats]:
+        (R,) = state
+        r, by_y = transfer(R, self.matched)
+        return r, by_y @ _by_turn(R, rays(self.matched.xy1))
+
+    def moved(self, state: State, step: Floats) -> State:
+        return (turned(state[0], step),)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Point transfer by a plane: x0 ~ (R + t m^T) x1."""
+
+    matched: Matched
+
+    def rows(self, state: State) -> tuple[Floats, Floats]:
+        R, t, m = state
+        b = rays(self.matched.xy1)
+        r, by_y = transfer(R + np.outer(t, m), self.matched)
+        by_direction = (b @ m)[:, None, None] * tangent_basis(t)
+        by_plane = t[None, :, None] * b[:, None, :]
+        return r, by_y @ np.concatenate([_by_turn(R, b), by_direction, by_plane], axis=2)
+
+    def moved(self, state: State, step: Floats) -> State:
+        return turned(state[0], step[:3]), shifted(state[1], step[3:5]), state[2] + step[5:]
+
+
+def transfer(H: Floats, matched: Matched) -> tuple[Floats, Floats]:
+    """Whitened h(x1) - x0 (m, 2) of the homography H (3, 3), and its derivative (m, 2, 3) by y = H x1.
+
+    The whitening is held: its own change is of second order. Points that H sends to infinity miss by very much.
+    """
+    y = rays(matched.xy1) @ H.T
+    depth = np.where(np.abs(y[:, 2]) > 1e-9, y[:, 2], 1e-9)
+    h = y[:, :2] / depth[:, None]
+    by_y = np.zeros((len(y), 2, 3))
+    by_y[:, 0, 0] = by_y[:, 1, 1] = 1.0 / depth
+    by_y[:, :, 2] = -h / depth[:, None]
+    A = by_y @ H[:, :2]
+    whitener = _whitener(A) / matched.sigma[:, None, None]
+    return np.asarray((whitener @ (h - matched.xy0)[:, :, None])[:, :, 0]), whitener @ by_y
+
+
+def _whitener(A: Floats) -> Floats:
+    """Inverse Cholesky factors (m, 2, 2) of I + A A^T."""
+    p = 1.0 + A[:, 0, 0] ** 2 + A[:, 0, 1] ** 2
+    q = A[:, 0, 0] * A[:, 1, 0] + A[:, 0, 1] * A[:, 1, 1]
+    r = 1.0 + A[:, 1, 0] ** 2 + A[:, 1, 1] ** 2
+    out = np.zeros_like(A)
+    out[:, 0, 0] = 1.0 / np.sqrt(p)
+    out[:, 1, 1] = 1.0 / np.sqrt(r - q**2 / p)
+    out[:, 1, 0] = -q / p * out[:, 1, 1]
+    return out
+
+
+def _by_turn(R: Floats, b: Floats) -> Floats:
+    """Derivative (m, 3, 3) of R Exp(w) b by w: -R [b]x."""
+    return cross(b[:, None, :], R)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """State of least cost; whitened residuals (m, k) there, half the loss, and the information (p, p)."""
+
+    state: State
+    residual: Floats
+    cost: float
+    information: Floats
+    gradient: Floats
+    jacobian: Floats
+
+    @property
+    def square(self) -> Floats:
+        """Squared whitened miss (m,) of every match."""
+        return np.asarray(np.einsum("mk,mk->m", self.residual, self.residual))
+
+
+def minimise(
+    model: Model,
+    state: State,
+    *,
+    reach: float | None = None,
+    prior: RotationPrior | None = None,
+    iterations: int = ITERATIONS,
+) -> Fit:
+    """The state that fits best, from a start.
+
+    Parameters
+    ----------
+    reach : of a Geman-McClure loss on each match, in sigmas; None: least squares
+    prior : added as a residual without loss
+    """
+    fit, damping = _weighed(model, state, reach, prior), SEED_DAMPING
+    for _ in range(iterations):
+        step = _step(fit, damping)
+        trial = _weighed(model, model.moved(fit.state, step), reach, prior)
+        if trial.cost <= fit.cost:
+            settled = float(step @ fit.information @ step) < (SMALL_STEP if reach is None else ROUGH_STEP)
+            fit, damping = trial, damping / 10.0
+            if settled:
+                break
+        elif damping > 1e6:
+            break
+        else:
+            damping *= 10.0
+    return fit
+
+
+def _step(fit: Fit, damping: float) -> Floats:
+    scale = np.diag(fit.information)
+    floor = 1e-12 * max(float(scale.max()), np.finfo(float).tiny)  # directions nothing is known of stay where they are
+    return np.asarray(-np.linalg.solve(fit.information + np.diag(damping * scale + floor), fit.gradient))
+
+
+def _weighed(model: Model, state: State, reach: float | None, prior: RotationPrior | None) -> Fit:
+    r, J = model.rows(state)
+    square = np.einsum("mk,mk->m", r, r)
+    weight, cost = np.ones(len(r)), 0.5 * float(square.sum())
+    if reach is not None:
+        weight = 1.0 / (1.0 + square / reach**2)
+        cost, weight = 0.5 * float((square * weight).sum()), weight**2
+    flat = (weight[:, None, None] * J).reshape(-1, J.shape[2])
+    information = flat.T @ J.reshape(-1, J.shape[2])
+    gradient = flat.T @ r.ravel()
+    if prior is not None:
+        # d Log(prior^T R Exp(w)) / dw is I but for the deviation itself, which is small where the prior is believed
+        deviation = prior.deviation(state[0])
+        information[:3, :3] += np.eye(3) / prior.sigma**2
+        gradient[:3] += deviation / prior.sigma
+        cost += 0.5 * float(deviation @ deviation)
+    return Fit(state, r, cost, information, gradient, J)
