@@ -21,10 +21,14 @@ Times = NDArray[np.int64]
 NOWHERE: Times = np.zeros(0, dtype=np.int64)
 
 
+# Longest window inside a gap, s, or as a share of the gap: as fine as what nobody measured strays.
+GAP_SPACING_S, GAP_SHARE = 0.5, 0.05
+
+
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """max_spacing_s : longest window outside gaps; merge_s : aiding epochs closer than this share a keyframe;
-    lead_s : how far keyframes reach beyond the first and the last absolute measurement."""
+    """max_spacing_s : longest window outside gaps (inside, see `GAP_SPACING_S`); merge_s : aiding epochs closer than
+    this share a keyframe; lead_s : how far keyframes reach beyond the first and the last absolute measurement."""
 
     max_spacing_s: float = 1.0
     merge_s: float = 1e-4
@@ -48,7 +52,7 @@ def keyframe_times(
 ) -> Times:
     """Strictly increasing keyframe stamps (n,) from span_ns[0] to span_ns[1].
 
-    Aiding epochs win over everything they stand closer to than `merge_s`; inside a gap only aiding adds keyframes.
+    Aiding epochs win over everything they stand closer to than `merge_s`.
     `standstills` are the stamps that standstills ask for: their borders, and what lies between.
     """
     start, end = span_ns
@@ -68,10 +72,12 @@ def keyframe_times(
 
 
 def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float) -> Times:
-    """Evenly spaced stamps between those of `fixed` that stand too far apart, outside gaps."""
+    """Evenly spaced stamps between those of `fixed` that stand too far apart."""
     length = np.diff(fixed)
-    parts = np.maximum(np.ceil(length / NS / spacing_s - 1e-9).astype(np.int64), 1)
-    parts[inside(gaps, fixed[:-1] + length // 2)] = 1
+    spacing = np.full(length.shape, spacing_s)
+    for gap in gaps:
+        spacing[inside([gap], fixed[:-1] + length // 2)] = max(GAP_SPACING_S, GAP_SHARE * gap.length_s)
+    parts = np.maximum(np.ceil(length / NS / spacing - 1e-9).astype(np.int64), 1)
     pieces = [
         ns_from_seconds(np.arange(1, n) * (step / NS / n)) + begin
         for begin, step, n in zip(fixed[:-1], length, parts, strict=True)

@@ -53,7 +53,8 @@ class FixResiduals:
     """Residuals of one stream of positions at its keyframes.
 
     rows (m,); keyframe (m,) position in the estimate; residual (m, 3) nav m; sigma (m, 3) m as used;
-    posterior (m, 3) variance of the predicted position, m^2
+    posterior (m, 3) variance of the predicted position, m^2; clock (m, 1) m that a clock not yet looked at may put
+    between a good fix and its neighbours
     """
 
     rows: NDArray[np.intp]
@@ -61,6 +62,7 @@ class FixResiduals:
     residual: Floats
     sigma: Floats
     posterior: Floats
+    clock: Floats
 
     @property
     def square(self) -> Floats:
@@ -92,7 +94,17 @@ def fix_residuals(
     P = estimate.covariance[keyframe][:, :6, :6]
     there = np.concatenate([-skew(turned(R, lever)), np.broadcast_to(np.eye(3), R.shape)], axis=2)  # of the antenna
     posterior = np.diagonal(there @ P @ there.transpose(0, 2, 1), axis1=1, axis2=2)
-    return FixResiduals(rows, keyframe, residual, sigma, posterior)
+    return FixResiduals(rows, keyframe, residual, sigma, posterior, _by_clock(builder, v, memory))
+
+
+def _by_clock(builder: PositionBuilder, v: Floats, memory: Memory) -> Floats:
+    """What a clock offset tau puts (m, 1) between a fix and its neighbours, tau |v_k+1 - v_k-1| : a shift of all along
+    the way is no contradiction. Nothing once tau is a state."""
+    if memory.stage >= LAST_STAGE or not len(v):
+        return np.zeros((len(v), 1))
+    around = np.concatenate([v[:1], v, v[-1:]])
+    change = np.linalg.norm(around[2:] - around[:-2], axis=1, keepdims=True)
+    return np.asarray(builder.config.time_offset_sigma * change)
 
 
 def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
@@ -137,7 +149,7 @@ def verdicts(
 
 def _position_verdict(builder: PositionBuilder, found: FixResiduals, memory: Memory) -> Verdict:
     sigma = np.maximum(builder.scaled_sigma(memory)[found.rows], builder.least_gate_sigma)
-    square = ((found.residual / sigma) ** 2).sum(axis=1)
+    square = (found.residual**2 / (sigma**2 + found.clock**2)).sum(axis=1)
 
     def limit(level: float, probability: float | None) -> Floats:
         return builder.limit(level, found.rows, probability)

@@ -129,13 +129,13 @@ def _scaled(stack: Stack, windows: Sequence[Window], estimate: Estimate) -> _Lin
     place = {block.t_ns: row for row, block in enumerate(stack.blocks)}
     rows = [place[w.t1_ns] for w in windows]
     before, after = np.concatenate([pose, velocity, bias], axis=2), np.concatenate([pose_j, velocity_j], axis=2)
-    root = scale.unpacked(stack.data)["root"].reshape(-1, 9, 9)
+    root = scale.MODEL.unpacked(stack.data)["root"].reshape(-1, 9, 9)
     return _Linear(residual[rows], before[rows], after[rows], root[rows])
 
 
 def _factors(windows: Sequence[Window], rows: NDArray[np.intp], estimate: Estimate) -> _Factors:
-    stacks = estimate.stacks("imu")
-    residual, before, after, root = _scaled(stacks[0], windows, estimate) if stacks else _native(windows, estimate)
+    scaled = next((stack for stack in estimate.stacks("imu") if stack.model is scale.MODEL), None)
+    residual, before, after, root = _scaled(scaled, windows, estimate) if scaled else _native(windows, estimate)
     marginals = estimate.marginals
     mixed = before @ marginals.following[rows - 1][:, :, :9] @ after.transpose(0, 2, 1)
     carried = before @ marginals.joint[rows - 1] @ before.transpose(0, 2, 1)

@@ -6,21 +6,31 @@ what stands before and after it,
     sum_j w_j x_j,    x = the samples at the borders, means over 0 - 0.1, 0.1 - 0.3, 0.3 - 0.6 s before and after,
 
 axis by axis, with the weights that serve best on the honest stretches of the same recording, each of which is bridged
-as if it were a gap (ridge regression towards the mean of all looks or the straight line between the borders). What is
-left where the weights were not learnt, part by part of the recording and on stretches that look alike, is the noise of
-the bridge. Vibration asks for long means, a turn for a slope: the recording knows.
+as if it were a gap (ridge regression towards the mean of all looks or the straight line between the borders). Vibration
+asks for long means, a turn for a slope: the recording knows.
+
+What is left where the weights were not learnt, part by part of the recording and on stretches that look alike, is the
+noise of the bridge. Readings stray from it and come back, a Brownian bridge beside white noise: over a gap of length T
+the amplitude of the n-th sine has the variance
+
+    E a_n^2 = q (T / n pi)^2 + D^2,    a_n = sqrt(2 / T) int e sin(n pi t / T) dt
+
+A vehicle's speed and course change slowly (q), its vertical force and its rolling shake (D). What axes do together,
+the lateral force and the yaw rate of a bend, is told by the products of their amplitudes.
 
 Source: Priestley (1981), Spectral Analysis and Time Series, 10.3, on linear interpolation; Hastie, Tibshirani, Friedman
-(2009), The Elements of Statistical Learning, 3.4 and 7.10, on ridge regression and cross-validation.
+(2009), The Elements of Statistical Learning, 3.4 and 7.10, on ridge regression and cross-validation; Karatzas, Shreve
+(1991), Brownian Motion and Stochastic Calculus, 5.6, on the bridge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from smartnav_graph.calibration.model import ImuNoise
 from smartnav_graph.streams import Imu
@@ -36,6 +46,8 @@ LEAST, MOST = 30, 2000
 RIDGES = (1e-2, 1.0, 1e6)
 # Share of the stretches, those most alike, that tell the noise of a gap.
 ALIKE = 0.1
+# Sines that what is left is told by, and the cells of a stretch that their amplitudes are summed over.
+SINES, CELLS = 6, 24
 # Parts of the recording, each of which is bridged by what the others teach.
 FOLDS = 6
 # A bridge is never surer than so many times honest data; so many times where there is nothing to learn from.
@@ -45,11 +57,19 @@ FLOOR, UNKNOWN = 3.0, 30.0
 @dataclass(frozen=True)
 class Bridge:
     """Noise densities (3,) accel m/s^2/sqrt(Hz) and gyro rad/s/sqrt(Hz) across a gap; told (2, 6) : mean and slant of
-    force m/s^2 and rate rad/s over it, None where nothing is known and a straight line has to do."""
+    force m/s^2 and rate rad/s over it, None where nothing is known and a straight line has to do; wander (6, 6) :
+    the diffusion q a second by which force m/s^2 and rate rad/s stray from that."""
 
     accel: Floats
     gyro: Floats
     told: Floats | None = None
+    wander: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def over(self, length_s: float) -> Bridge:
+        """The bridge as white noise alone over a window at whose borders nothing has strayed, or what has is known."""
+        within = np.diag(self.wander) * length_s**2 / 12.0
+        white = np.sqrt(np.concatenate([self.accel, self.gyro]) ** 2 + within)
+        return replace(self, accel=white[:3], gyro=white[3:], wander=np.zeros((6, 6)))
 
 
 class Recorded:
@@ -109,14 +129,16 @@ def _seen(recorded: Recorded, start: Floats, end: Floats, looks: Sequence[Look])
 
 @dataclass(frozen=True)
 class Learnt:
-    """How mean and slant over a gap follow from the looks: level (6,) that all counts from, weights (2, 6, k) by axis;
-    square (3, m, 6) of the density of noise that covers what was left of each stretch where they were not learnt, seen
-    (m, 6, k) : what the looks showed there."""
+    """How mean and slant over a gap of length_s follow from the looks: level (6,) that all counts from, weights
+    (2, 6, k) by axis; left (n, m, 6) : sines of what was left of each stretch where they were not learnt, seen
+    (m, 6, k) : what the looks showed there; together (6, 6) : correlation of what is left."""
 
+    length_s: float
     level: Floats
     weights: Floats
-    square: Floats
+    left: Floats
     seen: Floats
+    together: Floats
 
     def told(self, seen: Floats) -> Floats:
         """Mean and slant (2, 6) by what the looks (6, k) show."""
@@ -124,13 +146,17 @@ class Learnt:
         found[0] += self.level
         return np.asarray(found)
 
-    def density(self, seen: Floats) -> Floats:
-        """Noise density (6,) by the stretches that looked most alike: a turn is harder to carry on than a straight."""
+    def noise(self, seen: Floats) -> tuple[Floats, Floats]:
+        """White density (6,) and diffusion (6, 6) by the stretches that looked most alike: a turn is harder to
+        carry on than a straight."""
         apart = np.linalg.norm(self.seen - seen, axis=2)
         count = max(LEAST, round(ALIKE * len(apart)))
         alike = np.argsort(apart, axis=0, kind="stable")[:count]
-        kinds = np.take_along_axis(self.square, alike[None], axis=1).mean(axis=1)
-        return np.asarray(np.sqrt(kinds.max(axis=0)))
+        spectrum = (np.take_along_axis(self.left, alike[None], axis=1) ** 2).mean(axis=1)
+        frequency = np.pi * np.arange(1, SINES + 1) / self.length_s
+        parts = np.stack([np.ones(SINES), frequency**-2.0], axis=1)
+        white, root = np.sqrt(np.transpose([nnls(parts, column)[0] for column in spectrum.T]))
+        return white, root[:, None] * self.together * root
 
 
 def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt | None:
@@ -150,18 +176,29 @@ def _learn(recorded: Recorded, length: float, looks: Sequence[Look]) -> Learnt |
         for truth, targets in ((mean - level, _flat(looks)), (slant, _slanting(looks)))
     ]
     weights, error = (np.array([[pair[i] for pair in axes] for axes in best]) for i in range(2))
-    return Learnt(level, weights, _squares(recorded, start, end, error.transpose(0, 2, 1)), seen)
+    told = np.array([mean, slant]) - error.transpose(0, 2, 1)
+    left = _sines(recorded, start, length, told)
+    return Learnt(length, level, weights, left, seen, _together(left, (last - first) / length))
 
 
-def _squares(recorded: Recorded, start: Floats, end: Floats, error: Floats) -> Floats:
-    """Squares (3, m, 6) of the white noise density that the errors (2, m, 6) of mean and slant speak for, and the error
-    of the integral over the first half of a gap of length T: D^2 / T, D^2 / 3 T and D^2 T / 2 are their variances."""
-    mean, slant = recorded.mean(start, end) - error[0], recorded.slant(start, end) - error[1]
-    first, last = recorded.at(recorded.signal, start), recorded.at(recorded.signal, end)
-    half = 0.5 * mean - (last - first) / 8.0 - 30.0 / 32.0 * (slant - (last - first) / 6.0)
-    missed = 0.5 * recorded.mean(start, 0.5 * (start + end)) - half
-    factors = np.array([1.0, 3.0, 2.0])[:, None, None] * (end - start)[:, None]
-    return np.asarray(factors * np.array([*error, missed]) ** 2)
+def _together(left: Floats, count: float) -> Floats:
+    """Correlation (6, 6) of the axes by sines (n, m, 6), each counting alike, drawn to none with the weight of as many
+    stretches as there are axes; count : stretches that do not overlap."""
+    level = np.sqrt((left**2).mean(axis=1, keepdims=True))
+    unit = (left / np.where(level > 0, level, 1.0)).reshape(-1, left.shape[2])
+    shrink = count / (count + left.shape[2])
+    return np.asarray(shrink * unit.T @ unit / len(unit) + (1.0 - shrink) * np.eye(left.shape[2]))
+
+
+def _sines(recorded: Recorded, start: Floats, length: float, told: Floats) -> Floats:
+    """Amplitudes (n, m, 6) of the sines of what the curve by mean and slant (2, m, 6) leaves of the stretches."""
+    x = (np.arange(CELLS) + 0.5) / CELLS
+    borders = start[:, None] + length * np.arange(CELLS + 1) / CELLS
+    within = np.diff(recorded.at(recorded.integral, borders), axis=1) * CELLS / length
+    first, last = recorded.at(recorded.signal, start), recorded.at(recorded.signal, start + length)
+    left = within - _curve(x[None, :, None], first[:, None], last[:, None], told[:, :, None])
+    sines = np.sin(np.pi * np.outer(np.arange(1, SINES + 1), x)) * np.sqrt(2.0 * length) / CELLS
+    return np.asarray(np.einsum("nk,mka->nma", sines, left))
 
 
 def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -239,8 +276,10 @@ def _bridge(recorded: Recorded, gap: Gap, imu: Imu, floor: ImuNoise) -> Bridge:
         learnt = _learn(recorded, span, looks)
         if learnt is not None:
             seen = _seen(recorded, start, end, looks)[0]
-            density = np.maximum(learnt.density(seen), FLOOR * least)
-            return Bridge(density[:3], density[3:], learnt.told(seen))
+            white, wander = learnt.noise(seen)
+            white = np.maximum(white, FLOOR * least)
+            found = Bridge(white[:3], white[3:], learnt.told(seen), wander)
+            return found if span == gap.length_s else found.over(span)
         span /= 2
     return Bridge(UNKNOWN * least[:3], UNKNOWN * least[3:])
 
@@ -257,7 +296,8 @@ def bridged(imu: Imu, gaps: Sequence[Gap], found: Mapping[int, Bridge]) -> Imu:
         told = found[gap.start_ns].told
         inside = slice(*np.searchsorted(t_ns, [gap.start_ns, gap.end_ns + 1]))
         if told is not None:
-            signal[inside] = _curve(t_ns[inside], signal[inside][0], signal[inside][-1], told)
+            x = (t_ns[inside] - gap.start_ns) / (gap.end_ns - gap.start_ns)
+            signal[inside] = _curve(x[:, None], signal[inside][0], signal[inside][-1], told)
     return Imu(t_ns=t_ns, accel=signal[:, :3], gyro=signal[:, 3:])
 
 
@@ -267,9 +307,8 @@ def _inner(gap: Gap, imu: Imu) -> NDArray[np.int64]:
     return np.arange(gap.start_ns + period, gap.end_ns, period, dtype=np.int64)
 
 
-def _curve(t_ns: NDArray[np.int64], first: Floats, last: Floats, told: Floats) -> Floats:
-    """Values (m, 6) from `first` to `last` (6,) with the mean and the slant asked for."""
-    x = ((t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0]))[:, None]
+def _curve(x: Floats, first: Floats, last: Floats, told: Floats) -> Floats:
+    """Values at x from 0 to 1, from `first` to `last` (6,) with the mean and the slant asked for."""
     mean, slant = told
     bump = 6.0 * (mean - 0.5 * (first + last)) - 30.0 * (1.0 - 2.0 * x) * (slant - (last - first) / 6.0)
     return np.asarray((1.0 - x) * first + x * last + x * (1.0 - x) * bump)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import scale
+from smartnav_graph.factors import scale, straying
 from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import LAST_STAGE, Memory, State, Step, Tag, Window, key
@@ -116,6 +116,7 @@ class ImuBuilder:
     weight: float = CLASS_WEIGHT
     _spent_s: float = 0.0
     _kept: dict[int, Kept] = field(default_factory=dict)
+    _straying: straying.Straying = field(default_factory=straying.Straying)
 
     def grows(self, memory: Memory) -> bool:
         """Whether there is more to learn once the trajectory is found: the noise, scale factors."""
@@ -135,12 +136,12 @@ class ImuBuilder:
         params.setIntegrationCovariance(np.eye(3) * self.config.integration_sigma**2)
         return params
 
-    def _bridge(self, window: Window) -> Bridge | None:
+    def _gap(self, window: Window) -> Gap | None:
+        """The gap that a window lies in."""
         if window.kind != "gap":
             return None
         middle = (window.t0_ns + window.t1_ns) // 2
-        start = next(gap.start_ns for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
-        return self.bridges[start]
+        return next(gap for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
 
     def turning(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Memory:
         """The memory with the gyro's noise of this window raised by what its turn may be off by.
@@ -207,35 +208,55 @@ class ImuBuilder:
         return factor.cloneWithNewNoiseModel(model)
 
     def _params_of(self, window: Window, memory: Memory) -> gtsam.PreintegrationParams:
-        bridge = self._bridge(window)
-        if bridge is not None:
-            return self.params(memory, bridge)
+        gap = self._gap(window)
+        if gap is not None:
+            return self.params(memory, self.bridges[gap.start_ns].over(window.length_s))
         cached: tuple[Memory, gtsam.PreintegrationParams] | None = getattr(self, "_cache", None)
         if cached is None or cached[0] is not memory:
             cached = (memory, self.params(memory))
             self._cache = cached
         return cached[1]
 
-    def _variance(self, pim: Any, length_s: float, previous: State, covariance: Floats) -> Floats:
+    def _variance(self, pim: Any, window: Window, previous: State, covariance: Floats) -> Floats:
         """Variance (3,) m^2 of the predicted position: the state's before, carried over, and the window's own."""
+        gap, length_s = self._gap(window), window.length_s
+        strayed = 0.0 if gap is None else straying.largest(gap, self.bridges[gap.start_ns])
         nav_R_body = previous.nav.attitude().matrix()
         own = np.diag(nav_R_body @ pim.preintMeasCov()[3:6, 3:6] @ nav_R_body.T)
         before = np.diag(covariance)
-        tilt = (0.5 * self.gravity * length_s**2) ** 2 * before[:3].max()
-        return np.asarray(before[3:6] + length_s**2 * before[6:9] + tilt + own)
+        lean = self.gravity**2 * before[:3].max() + strayed**2
+        return np.asarray(before[3:6] + length_s**2 * before[6:9] + (0.5 * length_s**2) ** 2 * lean + own)
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
+            self._straying.known.clear()
             return
-        i, j = window.index - 1, window.index
         memory = self.turning(window, previous.bias, memory)
         pim = self.preintegrate(window, previous.bias, memory)
         step.predicted = pim.predict(previous.nav, previous.bias)
         step.bias = previous.bias
         step.foretell = pim.predict
         if previous.covariance is not None:
-            step.variance = self._variance(pim, window.length_s, previous, previous.covariance)
+            step.variance = self._variance(pim, window, previous, previous.covariance)
+        self._add_inertial(step, window, previous, pim, memory)
+        i, j = window.index - 1, window.index
+        walk = gtsam.noiseModel.Diagonal.Sigmas(self.walk_sigma(memory) * np.sqrt(window.length_s))
+        same = gtsam.BetweenFactorConstantBias(key("B", i), key("B", j), gtsam.imuBias.ConstantBias(), walk)
+        step.add(Tag("imu_bias", window.t1_ns), same)
+
+    def _add_inertial(self, step: Step, window: Window, previous: State, pim: Any, memory: Memory) -> None:
+        """The window as GTSAM's factor, or as a row where further states change what was read."""
+        gap = self._gap(window)
+        if gap is not None:
+            ends = self._straying.add(step, window, gap, self.bridges[gap.start_ns])
+            if any(ends):
+                step.blocks.append(straying.row(window, ends, previous.bias, pim.preintMeasCov(), self.gravity))
+                return
+        elif self.config.scale_sigma > 0 and memory.stage == LAST_STAGE:
+            covariance = self._covariance(window, pim, memory)
+            scale.add(step, window, previous.bias, covariance, self.gravity, self.config.scale_sigma)
+            return
         used = pim.biasHat().vector()
 
         def refresh(bias: Any) -> Any:
@@ -243,20 +264,8 @@ class ImuBuilder:
                 return None
             return self._factor(window, self.preintegrate(window, bias, memory), memory)
 
-        if self.config.scale_sigma > 0 and memory.stage == LAST_STAGE and window.kind != "gap":
-            covariance = self._covariance(window, pim, memory)
-            scale.add(step, window, previous.bias, covariance, self.gravity, self.config.scale_sigma)
-        else:
-            step.refresh = refresh
-            step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
-        root = np.sqrt(window.length_s)
-        walk = self.walk_sigma(memory) * root
-        step.add(
-            Tag("imu_bias", window.t1_ns),
-            gtsam.BetweenFactorConstantBias(
-                key("B", i), key("B", j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(walk)
-            ),
-        )
+        step.refresh = refresh
+        step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
 
 
 def build(context: FactorContext) -> ImuBuilder:

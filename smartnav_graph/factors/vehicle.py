@@ -120,22 +120,25 @@ class DeclaredVelocity:
 
 class NonHolonomic:
     """Data: angular rate (3) rad/s and specific force (3) m/s^2 in declared vehicle axes, sigma (2) m/s lateral and
-    vertical. Residual (m, 2)."""
+    vertical. Residual (m, 2). strays : inside a gap, where the state G says how far both are from their bridge."""
 
-    extra: tuple[str, ...] = ("M",)
     width = 8
 
-    def __init__(self, body_R_vehicle: Floats) -> None:
+    def __init__(self, body_R_vehicle: Floats, *, strays: bool = False) -> None:
         self.body_R_vehicle = body_R_vehicle
+        self.extra: tuple[str, ...] = ("M", "G") if strays else ("M",)
 
     def observe(
         self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
     ) -> tuple[Floats, Floats, list[Floats]]:
         """See `observation.Observation`."""
-        (mount,) = extra
+        mount, *strayed = extra
+        measured = data[:, :6].reshape(-1, 2, 3)
+        for more in strayed:
+            measured = measured + more.reshape(-1, 2, 3)[:, ::-1] @ self.body_R_vehicle
         axes, declared = VehicleAxes.of(mount), DeclaredVelocity.of(R, v, self.body_R_vehicle)
         x, y, z, h, slip, squat = mount[:, 2:].T
-        vel, rate, force = axes.turn(declared.rows), axes.turn(data[:, :3]), axes.turn(data[:, 3:6])
+        vel, rate, force = axes.turn(declared.rows), axes.turn(measured[:, 0]), axes.turn(measured[:, 1])
         (vx, vy, vz), (wx, wy, wz), (fx, fy, _) = vel.rows.T, rate.rows.T, force.rows.T
         residual = np.stack([vy + wz * x - wx * z + slip * fy * vx, vz + wx * y - wy * h + squat * fx * vx], axis=1)
         o, one = np.zeros(len(v)), np.ones(len(v))
@@ -151,7 +154,9 @@ class NonHolonomic:
         weight = 1.0 / data[:, 6:8, None]
         by_state = by_velocity @ axes.rotation @ declared.by_state
         by_mount = np.concatenate([by_axes, by_rest], axis=2)
-        return residual * weight[:, :, 0], by_state * weight, [by_mount * weight]
+        read = axes.rotation @ self.body_R_vehicle.T
+        by_strayed = [np.concatenate([by_force @ read, by_rate @ read], axis=2) for _ in strayed]
+        return residual * weight[:, :, 0], by_state * weight, [by * weight for by in (by_mount, *by_strayed)]
 
 
 def mount_state(config: VehicleConfig) -> SessionState:
@@ -175,10 +180,10 @@ def due(window: Window, period_s: float) -> bool:
 
 @dataclass
 class VehicleBuilder:
-    """Adds one row of the constraint a period, outside gaps and standstills.
+    """Adds one row of the constraint a period, outside standstills, and in gaps where rate and force have a state.
 
-    body_R_vehicle (3, 3) : declared axes; gaps : where rate and force are not known; rests : where zero velocity says
-    it all already
+    body_R_vehicle (3, 3) : declared axes; gaps : where rate and force were not recorded; rests : where zero velocity
+    says it all already
     """
 
     body_R_vehicle: Floats
@@ -191,23 +196,28 @@ class VehicleBuilder:
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
+        self.strayed = AtKeyframe(NonHolonomic(self.body_R_vehicle, strays=True))
         noise = self.noise
         self.noise_groups = {"vehicle_lateral": noise.lateral_sigma, "vehicle_vertical": noise.vertical_sigma}
 
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """One row at the end of the window, where one is due."""
-        if not len(window.dt) or not due(window, self.config.period_s) or self._silent(window.t1_ns):
+        if not len(window.dt) or not due(window, self.config.period_s) or self._silent(step):
             return
         rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
         force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
         sigma = [known * memory.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
-        keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.config)))
-        step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))
+        keys = [key("X", step.index), key("V", step.index), step.use(mount_state(self.config))]
+        strays = key("G", step.index) in step.chain
+        model = self.strayed if strays else self.model
+        keys += [key("G", step.index)] * strays
+        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, loss=self.config.loss))
 
-    def _silent(self, t_ns: int) -> bool:
-        still = self.rests is not None and np.isfinite(self.rests.speed_at(t_ns))
-        return bool(still) or any(gap.start_ns < t_ns < gap.end_ns for gap in self.gaps)
+    def _silent(self, step: Step) -> bool:
+        still = self.rests is not None and np.isfinite(self.rests.speed_at(step.t_ns))
+        unknown = any(gap.start_ns < step.t_ns < gap.end_ns for gap in self.gaps)
+        return bool(still) or (unknown and key("G", step.index) not in step.chain)
 
 
 def build(context: FactorContext) -> VehicleBuilder | None:

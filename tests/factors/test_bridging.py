@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.factors.bridging import FLOOR, UNKNOWN, bridged, bridges
+from smartnav_graph.factors.bridging import FLOOR, UNKNOWN, Bridge, bridged, bridges
 from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import NS, Gap, ns_from_seconds
 
@@ -66,8 +66,47 @@ def test_the_noise_is_what_unseen_gaps_turn_out_to_cost(noise):
     found = bridges(straight(imu, gaps), gaps, NOISE)
     error = np.array([found[gap.start_ns].told[0] - mean(imu, gap) for gap in gaps])
     cost = np.sqrt((error**2).mean(axis=0) * gaps[0].length_s)  # as a density
-    told = np.concatenate([found[gaps[0].start_ns].accel, found[gaps[0].start_ns].gyro])
-    np.testing.assert_allclose(told, cost, rtol=0.35)
+    whole = found[gaps[0].start_ns].over(gaps[0].length_s)
+    told = np.concatenate([whole.accel, whole.gyro])
+    np.testing.assert_allclose(told, cost, rtol=0.5)
+
+
+def wandering(seconds: float, seed: int) -> Imu:
+    """Force ahead and to the left wander by 0.6 m/s^2/sqrt(s) and are drawn back within 20 s; the yaw rate is a tenth
+    of the force to the left; white noise of 0.05 m/s^2/sqrt(Hz) upwards. 50 Hz."""
+    rng = np.random.default_rng(seed)
+    n, dt = round(50 * seconds), 0.02
+    accel, gyro = np.tile([0.0, 0.0, GRAVITY], (n, 1)), 1e-4 * rng.standard_normal((n, 3))
+    for k in range(1, n):
+        accel[k, :2] = accel[k - 1, :2] * np.exp(-dt / 20.0) + 0.6 * np.sqrt(dt) * rng.standard_normal(2)
+    gyro[:, 2] += 0.1 * accel[:, 1]
+    accel[:, 2] += 0.05 / np.sqrt(dt) * rng.standard_normal(n)
+    return Imu(t_ns=ns_from_seconds(np.arange(n) * dt), accel=accel, gyro=gyro)
+
+
+def test_what_wanders_is_told_from_what_shakes_and_what_goes_together():
+    imu = wandering(900.0, 3)
+    found = bridges(imu, [hole(imu, 20_000, 150)], NOISE)[int(imu.t_ns[20_000])]
+    q = found.wander
+    np.testing.assert_allclose(np.sqrt(np.diag(q)[:2]), 0.6, rtol=0.25)
+    assert np.sqrt(q[5, 5]) == pytest.approx(0.06, rel=0.25)
+    assert q[1, 5] / np.sqrt(q[1, 1] * q[5, 5]) > 0.95 and abs(q[0, 1]) < 0.3 * q[1, 1]
+    assert found.accel[2] == pytest.approx(FLOOR * NOISE.accel_noise_density, rel=0.3)  # 0.09
+    assert np.sqrt(q[2, 2] * 3.0**2 / 12.0) < found.accel[2]
+    assert (np.linalg.eigvalsh(q) > -1e-12).all()
+
+
+def test_a_bridge_over_one_window_has_the_noise_of_its_mean():
+    """The mean of a Brownian bridge of diffusion q over T has the variance q T / 12, white noise D^2 / T."""
+    wander = np.zeros((6, 6))
+    wander[0, 0] = 0.49
+    bridge = Bridge(np.full(3, 0.1), np.full(3, 0.02), None, wander)
+    rng, T, n = np.random.default_rng(0), 2.0, 200
+    walk = np.cumsum(0.7 * np.sqrt(T / n) * rng.standard_normal((4000, n)), axis=1)
+    means = (walk - np.linspace(1 / n, 1, n) * walk[:, -1:]).mean(axis=1)
+    whole = bridge.over(T)
+    assert whole.accel[0] ** 2 / T == pytest.approx(0.01 / T + means.var(), rel=0.1)
+    assert whole.accel[1] == pytest.approx(0.1) and not whole.wander.any()
 
 
 def test_vibration_is_averaged():

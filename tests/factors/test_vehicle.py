@@ -82,6 +82,20 @@ def test_derivatives(model):
     state = rng.normal(0, 1, (m, MOUNT_SIZE)) * [0.5, 0.5, 1, 1, 1, 1, 0.02, 0.02]
     R, p, v = random_rotations(rng, m), rng.normal(0, 100, (m, 3)), rng.normal(0, 10, (m, 3))
     assert_observation(model, R, p, v, [state], data)
+    strays = NonHolonomic(model.body_R_vehicle, strays=True)
+    assert_observation(strays, R, p, v, [state, rng.normal(0, 0.3, (m, 6))], data)
+
+
+def test_what_readings_stray_by_is_added_to_them():
+    """As much rate and force in body axes as the same in the readings."""
+    rng, state = np.random.default_rng(4), mount(x=-1.2, z=0.5, h=0.7, slip=0.01, squat=0.01, yaw=0.1)
+    rate, force, strayed = rng.normal(0, 0.4, 3), rng.normal(0, 4, 3), rng.normal(0, 0.5, 6)
+    axes, velocity = PHONE.body_R_vehicle, (-0.4, 9.0, 0.2)
+    data = np.concatenate([rate, force, (1.0, 1.0)])[None]
+    at = (np.eye(3)[None], np.zeros((1, 3)), np.array([velocity]))
+    found = NonHolonomic(axes, strays=True).observe(*at, [state[None], strayed[None]], data)[0][0]
+    raised = residual(PHONE, np.eye(3), velocity, state, rate + strayed[3:] @ axes, force + strayed[:3] @ axes)
+    assert found == pytest.approx(raised)
 
 
 # --- the builder ------------------------------------------------------------------------------------------------------
@@ -130,9 +144,17 @@ def test_one_row_a_second_however_many_keyframes():
     assert sum(len(rows(builder, window(a, a + 0.25))) for a in edges) == 10
 
 
-def test_no_row_inside_a_gap_but_one_at_its_end():
+def test_no_row_inside_a_gap_of_which_nothing_is_known_but_one_at_its_end():
     builder = car(gaps=[Gap(round(10.4 * NS), 13 * NS, "missing")])
     assert [len(rows(builder, window(a, a + 1.0))) for a in (9.0, 10.0, 11.0, 12.0, 13.0)] == [1, 0, 0, 1, 1]
+
+
+def test_a_row_inside_a_gap_rests_on_what_readings_stray_by():
+    step, at = Step(3, 11 * NS, 11.0), window(10.0, 11.0)
+    step.bias, step.chain[key("G", 3)] = gtsam.imuBias.ConstantBias(), np.zeros(6)
+    car(gaps=[Gap(round(10.4 * NS), 13 * NS, "missing")]).add(step, at, None, Memory(stage=1))
+    (block,) = step.blocks
+    assert block.model.letters[2:] == ("M", "G") and block.keys[0][3] == key("G", 3)
 
 
 def test_no_row_at_a_standstill():
