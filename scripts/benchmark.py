@@ -9,6 +9,8 @@ batch-37min-full  the same with everything on: no calibration, fixes without sig
 batch-2h          two hours, as batch-37min; baseline: batch-37min
 replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive that comes with gtsam, lag 10 s;
                   baseline: scripts/bare_fixed_lag.py
+vision-frontend   101 textured pictures of 640 x 480 with noise from disk, ORB 1500, 100 pairs of neighbours, on all
+                  processors (wall seconds); baseline: scripts/bare_front_end.py, OpenCV's own calls in one process
 """
 
 from __future__ import annotations
@@ -57,6 +59,11 @@ def bare_fixed_lag() -> Measured:
     return Measured(told["p99"] / 1e3, None, told)
 
 
+def bare_front_end(folder: str) -> Measured:
+    told = python(str(HERE / "bare_front_end.py"), folder)
+    return Measured(told["seconds"], None, told)
+
+
 def ours(kind: str, session: str) -> Measured:
     told = python(str(HERE / "benchmark.py"), "--measure", kind, session)
     return Measured(told["seconds"], told["peak_memory_mb"], told["detail"])
@@ -64,6 +71,9 @@ def ours(kind: str, session: str) -> Measured:
 
 def measure(kind: str, path: str) -> None:
     """In the fresh process: one run of a session in memory, told as a JSON line."""
+    if kind == "front-end":
+        measure_front_end(Path(path))
+        return
     import smartnav_graph as sn
     from smartnav_graph import estimate  # imports are not measured
 
@@ -83,8 +93,38 @@ def measure(kind: str, path: str) -> None:
     detail["cpu_s"] = round(seconds, 4)
     if kind == "replay":
         seconds = run.summary["update_ms"]["p99"] / 1e3
+    tell(seconds, detail)
+
+
+def tell(seconds: float, detail: dict[str, Any]) -> None:
+    """What a fresh process says."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     print(json.dumps({"seconds": seconds, "peak_memory_mb": round(peak, 1), "detail": detail}))
+
+
+def measure_front_end(folder: Path) -> None:
+    """In the fresh process: pictures of a folder to matches in memory."""
+    import cv2  # noqa: F401  imports are not measured
+    import numpy as np
+    from bare_front_end import DISTORTION, FOCAL, HEIGHT, WIDTH
+
+    import smartnav_graph as sn
+    from smartnav_graph.calibration.camera import Camera
+    from smartnav_graph.streams import Images
+    from smartnav_graph.vision.front_end import FrontEndConfig, find
+
+    files = np.array(sorted(file.name for file in folder.glob("*.png")), dtype=object)
+    centre = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    camera = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, *centre, distortion=tuple(DISTORTION.tolist()))
+    names, ids = np.full(len(files), "cam0", dtype=object), np.arange(len(files))
+    images = Images(t_ns=ids * 250_000_000, image_id=ids, file=files, camera=names)
+    session = sn.Session(images=images, pictures=folder, calibration=sn.Calibration(cameras={"cam0": camera}))
+    cpu, begin = time.process_time(), time.perf_counter()
+    report = find(session, FrontEndConfig(spans=(1,))).report
+    seconds = time.perf_counter() - begin
+    told = {"pairs_per_s": round(report.pairs / seconds, 1), "cpu_s": round(time.process_time() - cpu, 4)}
+    keys = ("pairs", "matches", "ms_picture", "ms_pair")
+    tell(seconds, told | {key: getattr(report, key) for key in keys})
 
 
 def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
@@ -123,6 +163,10 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
     if name == "batch-2h":
         long = make_session("car-2h", folder)
         return lambda: ours("batch", long), lambda: ours("batch", plain), {}
+    if name == "vision-frontend":
+        pictures = folder / "pictures"
+        subprocess.run([sys.executable, str(HERE / "bare_front_end.py"), "make", str(pictures)], check=True)
+        return lambda: ours("front-end", str(pictures)), lambda: bare_front_end(str(pictures)), {}
     return lambda: ours("replay", "gtsam-kitti"), bare_fixed_lag, {}
 
 
@@ -143,7 +187,7 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
     }
 
 
-NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag")
+NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag", "vision-frontend")
 
 
 def main() -> None:

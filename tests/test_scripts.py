@@ -81,3 +81,16 @@ def test_the_baseline_runs():
     command = [sys.executable, ROOT / "scripts" / "bare_gtsam.py", "2", "imu"]
     told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert set(told["cpu_s"]) == {"preintegrate", "build", "solve", "covariance"} and told["rms_m"] < 10.0
+
+
+def test_the_front_end_is_measured_beside_bare_opencv(tmp_path):
+    def told(*arguments: object) -> dict[str, float]:
+        command = [sys.executable, *map(str, arguments)]
+        return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    scripts, folder = ROOT / "scripts", tmp_path / "pictures"
+    subprocess.run([sys.executable, scripts / "bare_front_end.py", "make", folder, "4"], check=True)
+    ours = told(scripts / "benchmark.py", "--measure", "front-end", folder)["detail"]
+    bare = told(scripts / "bare_front_end.py", folder)
+    assert ours["pairs"] == bare["pairs"] == 3
+    assert ours["matches"] > 1500 and bare["matches"] > 1500  # of 3 x 1500 points
