@@ -61,13 +61,13 @@ def car(duration: float, rng: np.random.Generator, *, start_speed: float = 0.0) 
     return Trajectory(way, sway=_SPRINGS, sway_speed=15.0)
 
 
-def slip(rng: np.random.Generator, sigma: float) -> tuple[Sway, ...]:
+def slip(rng: np.random.Generator, sigma: float, axes: tuple[int, ...] = (0, 2)) -> tuple[Sway, ...]:
     """Side and vertical speeds of `sigma` m/s each (root mean square at the sway speed) that no vehicle should have.
 
     Three slow sines a direction with phases of their own: samples a second apart are nearly independent.
     """
     waves = []
-    for axis in (0, 2):
+    for axis in axes:
         for hertz in (0.31, 0.37, 0.43):
             shift = [0.0, 0.0, 0.0]
             shift[axis] = sigma * np.sqrt(2.0 / 3.0) / (2 * np.pi * hertz)
@@ -98,38 +98,46 @@ _CASTORS = (
 
 
 @dataclass(frozen=True)
-class Rounds:
-    """A trolley pushed counter-clockwise round a rectangle of corridors, from a rest in the middle of its east side.
+class Corridors:
+    """A trolley pushed along the corridors of a grid, turned on the spot where they cross, from a long rest.
 
     It starts at the origin facing north, which is what a start from a rest takes for granted where nothing else is
-    told. `straights_s` are the times between two corners along the sides north-south and east-west. After every three
-    corners it stops in the middle of a side.
+    told. Between two crossings it takes `drive_s` seconds, speeding up and slowing down within `ramp_s`. Each word of
+    `turns` is the way to the next stop of `stop_s`: at every letter it halts, turns by 90 deg to the left (L) or right
+    (R) within `turn_s`, halts again, each time for `halt_s`, and drives on. Nothing that people lean on is quite at
+    rest: `fidget_m_s` is the speed left an axis, root mean square.
     """
 
-    straights_s: tuple[float, float] = (34.0, 18.0)
+    turns: tuple[str, ...] = ("LRL", "RRL", "LLL", "RRL", "LLL", "RRR", "RLL", "LLR", "LRR", "LRR")
     rest_s: float = 180.0
-    stops: int = 10
     stop_s: float = 10.0
-    speed_m_s: float = 1.0
-    corner_s: float = 4.0
+    drive_s: float = 18.8
     ramp_s: float = 2.0
+    turn_s: float = 4.0
+    halt_s: float = 0.8
+    speed_m_s: float = 1.0
+    fidget_m_s: float = 5e-4
     sway: tuple[Sway, ...] = _CASTORS
+
+    @property
+    def spacing_m(self) -> float:
+        """Metres between two crossings."""
+        return self.speed_m_s * (self.drive_s - self.ramp_s)
 
     def __call__(self, seconds: float, rng: np.random.Generator) -> Trajectory:
         """The motion; it takes as long as it takes."""
         legs = [Leg(self.rest_s, 0.0)]
-        for stop in range(self.stops):
-            legs += self._drive(stop)
-        return Trajectory(Legs(legs), sway=self.sway, sway_speed=self.speed_m_s)
+        halt = Leg(self.halt_s, 0.0)
+        for word in self.turns:
+            for letter in word:
+                legs += [*self._drive(), halt, Leg(self.turn_s, 0.0, 90.0 if letter == "L" else -90.0), halt]
+            legs += [*self._drive(), Leg(self.stop_s, 0.0)]
+        fidget = slip(rng, self.fidget_m_s, axes=(0, 1, 2))
+        return Trajectory(Legs(legs), sway=self.sway, sway_speed=self.speed_m_s, fidget=fidget)
 
-    def _drive(self, stop: int) -> list[Leg]:
-        """Half a side, three corners with the sides between them, half a side, and the stop."""
-        here, other = (self.straights_s[(stop + k) % 2] for k in range(2))
-        ramp, v = self.ramp_s, self.speed_m_s
-        corner = Leg(self.corner_s, v, 90.0)
-        first = [Leg(ramp, v), Leg(here / 2 - ramp / 2, v)]
-        last = [Leg(other / 2 - ramp / 2, v), Leg(ramp, 0.0), Leg(self.stop_s, 0.0)]
-        return [*first, corner, Leg(other, v), corner, Leg(here, v), corner, *last]
+    def _drive(self) -> list[Leg]:
+        v = self.speed_m_s
+        return [Leg(self.ramp_s, v), Leg(self.drive_s - 2 * self.ramp_s, v), Leg(self.ramp_s, 0.0)]
 
 
 def in_a_room(duration: float, rng: np.random.Generator) -> Trajectory:

@@ -14,7 +14,7 @@ from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.cameras import LOOKING_AHEAD, CameraModel, Faults
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.recording import Scenario
-from smartnav_graph.simulation.scenes import FurnishedRoom, RingCorridor
+from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory
 
@@ -79,10 +79,11 @@ _ROOM = CameraModel(
     tracked=True,
     faults=Faults(lost=0.01),
 )
+_TROLLEY = motions.Corridors()
 _CORRIDORS = CameraModel(
     camera=PHONE_CAMERA,
     mount=_ON_PHONE,
-    scene=RingCorridor(south_west_m=(-22.71, -19.35), north_east_m=(0.0, 19.35), hall_m=6.0, per_m2=12.0),
+    scene=CorridorGrid(nodes=(4, 6), origin=(3, 0), spacing_m=_TROLLEY.spacing_m, per_m2=20.0),
     rate_hz=1.25,
     count=(15, 60),
     pairs=(1,),
@@ -124,7 +125,9 @@ SCENARIOS: dict[str, Scenario] = {
             **_ALL_SENSORS,
         ),
         Scenario("room-30s", 30.0, motions.in_a_room, profile="galaxy-s2", camera=_ROOM),
-        Scenario("trolley-20min", 1200.0, motions.Rounds(), profile="galaxy-s2", camera=_CORRIDORS),
+        Scenario(
+            "trolley-20min", 1200.0, _TROLLEY, profile="galaxy-s2-warming", camera=_CORRIDORS, rest_sigma_m_s=5e-4
+        ),
     )
 }
 

@@ -20,6 +20,8 @@ Rows = NDArray[np.intp]
 
 # Share of the way to a point within which another face hides it; the point itself lies on a face.
 _BEFORE = 1.0 - 1e-6
+# Metres before a face at which there must be room to see it from.
+_CLEAR_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,10 @@ class Scene:
         """Mask of the points with another face on the way to them; what is closed hides by a face seen from here."""
         hidden, way = np.zeros(len(rows), dtype=bool), self.points[rows] - centre
         height = np.einsum("fi,fi->f", centre - self.corner, self.normal)
-        for f in np.flatnonzero(height > 0.0):
+        size = np.linalg.norm(self.u + self.v, axis=1) / 2
+        away = np.linalg.norm(self.corner + (self.u + self.v) / 2 - centre, axis=1) - size
+        farthest = np.sqrt((way**2).sum(axis=1).max(initial=0.0))
+        for f in np.flatnonzero((height > 0.0) & (away < farthest)):
             down = -way @ self.normal[f]
             share = height[f] / np.where(down > 0.0, down, np.inf)
             at = share[:, None] * way + (centre - self.corner[f])
@@ -71,13 +76,27 @@ class Scene:
 
 
 def build(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
-    """The faces of the boxes, with `per_m2` points a square metre scattered evenly on them."""
+    """The faces of the boxes, with `per_m2` points a square metre scattered evenly where nothing covers them."""
     faces = np.concatenate([_faces(box) for box in boxes])
     corner, u, v = faces[:, 0], faces[:, 1], faces[:, 2]
     area = np.linalg.norm(np.cross(u, v), axis=1)
     face = np.repeat(np.arange(len(area)), rng.poisson(per_m2 * area))
     a, b = rng.random((2, len(face), 1))
-    return Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face)
+    scene = Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face)
+    free = _free(scene.points + _CLEAR_M * scene.normal[face], boxes)
+    return Scene(corner, u, v, scene.points[free], face[free])
+
+
+def _free(points: Floats, boxes: Sequence[Box]) -> NDArray[np.bool_]:
+    """Mask of the places (n, 3) that lie in a room and in nothing that stands there."""
+    room, solid = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+    for box in boxes:
+        within = ((points >= box.low) & (points <= box.high)).all(axis=1)
+        if box.inward:
+            room |= within
+        else:
+            solid |= within
+    return room & ~solid
 
 
 def _faces(box: Box) -> Floats:
@@ -112,30 +131,37 @@ class FurnishedRoom:
 
 
 @dataclass(frozen=True)
-class RingCorridor:
-    """A corridor of `width_m` round a block of rooms, and a hall where the block is shorter by `hall_m` in the east.
+class CorridorGrid:
+    """Corridors of `width_m` along the lines of a grid of `nodes` (east, north) crossings, `spacing_m` apart, with
+    blocks of rooms between them, and cupboards along the outer walls.
 
-    Its middle line is the rectangle from `south_west_m` to `north_east_m`; floor and ceiling are at `floor_m` and
-    `ceiling_m`. Twelve cupboards stand along the outer walls, flat enough to pass. `per_m2` points a square metre.
+    The crossing at `origin` (east, north) of the grid lies at the nav origin; floor and ceiling are at `floor_m` and
+    `ceiling_m`. `per_m2` points a square metre.
     """
 
-    south_west_m: tuple[float, float]
-    north_east_m: tuple[float, float]
+    nodes: tuple[int, int]
+    spacing_m: float
+    origin: tuple[int, int] = (0, 0)
     width_m: float = 3.0
-    hall_m: float = 0.0
     floor_m: float = -1.0
     ceiling_m: float = 2.0
-    per_m2: float = 8.0
+    cupboards: int = 16
+    per_m2: float = 12.0
 
     def __call__(self, rng: np.random.Generator) -> Scene:
-        (west, south), (east, north), half = self.south_west_m, self.north_east_m, self.width_m / 2
-        low = np.array([west - half, south - half, self.floor_m])
-        high = np.array([east + half, north + half, self.ceiling_m])
-        block = Box((west + half, south + half, low[2]), (east - half - self.hall_m, north - half, high[2]))
-        boxes = [Box(_triple(low), _triple(high), inward=True), block]
-        for k in range(12):
+        half = self.width_m / 2
+        lines = [(np.arange(n) - at) * self.spacing_m for n, at in zip(self.nodes, self.origin, strict=True)]
+        low = np.array([lines[0][0] - half, lines[1][0] - half, self.floor_m])
+        high = np.array([lines[0][-1] + half, lines[1][-1] + half, self.ceiling_m])
+        boxes = [Box(_triple(low), _triple(high), inward=True)]
+        for west in lines[0][:-1]:
+            for south in lines[1][:-1]:
+                east, north = west + self.spacing_m - self.width_m, south + self.spacing_m - self.width_m
+                low_corner = (float(west + half), float(south + half), self.floor_m)
+                boxes.append(Box(low_corner, (float(east + half), float(north + half), self.ceiling_m)))
+        for k in range(self.cupboards):
             size = rng.uniform(0.8, 2.0), 0.35, rng.uniform(0.8, 2.0)
-            boxes.append(_along_wall(low, high, k % 4, (k // 4 + rng.uniform(0.1, 0.9)) / 3, size))
+            boxes.append(_along_wall(low, high, k % 4, rng.uniform(0.05, 0.95), size))
         return build(boxes, self.per_m2, rng)
 
 

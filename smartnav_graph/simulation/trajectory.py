@@ -150,12 +150,13 @@ class Sway:
 @dataclass(frozen=True)
 class Trajectory:
     """A way, how the device is held on it (yaw, pitch, roll in degrees), how it sways at `sway_speed` m/s, and where it
-    is `carried` (m to the right, ahead, up of the point that follows the way)."""
+    is `carried` (m to the right, ahead, up of the point that follows the way). `fidget` goes on at rest too."""
 
     way: Way
     held_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sway: tuple[Sway, ...] = ()
     sway_speed: float = 1.0
+    fidget: tuple[Sway, ...] = ()
     carried: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
@@ -205,10 +206,11 @@ class Trajectory:
 
     def _swayed(self, t: Floats, speed: Floats, speed1: Floats, speed2: Floats) -> tuple[list[Floats], list[Floats]]:
         """Shift and tilt, each as value, first and second derivative (n, 3)."""
-        e, e1, e2 = (order / self.sway_speed for order in (speed, speed1, speed2))
+        moving = tuple(order / self.sway_speed for order in (speed, speed1, speed2))
+        always = (np.ones_like(t), np.zeros_like(t), np.zeros_like(t))
         shift = [np.zeros((len(t), 3)) + np.asarray(order) for order in (self.carried, 0.0, 0.0)]
         tilt = [np.zeros((len(t), 3)) + np.radians(self.held_deg), *(np.zeros((len(t), 3)) for _ in range(2))]
-        for wave in self.sway:
+        for wave, (e, e1, e2) in [(w, moving) for w in self.sway] + [(w, always) for w in self.fidget]:
             w = 2 * np.pi * wave.hertz
             s, c = np.sin(w * t + wave.phase), np.cos(w * t + wave.phase)
             orders = (e * s, e1 * s + e * w * c, e2 * s + 2 * e1 * w * c - e * w**2 * s)

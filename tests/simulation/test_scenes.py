@@ -7,7 +7,7 @@ import pytest
 
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.simulation import scenes
-from smartnav_graph.simulation.scenes import Box, FurnishedRoom, RingCorridor
+from smartnav_graph.simulation.scenes import Box, CorridorGrid, FurnishedRoom
 
 ROOM = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0), inward=True)
 
@@ -46,13 +46,19 @@ def test_a_pillar_throws_its_shadow():
     assert (scene.points[seen][pillar[seen], 0] == 2.0).all()  # its front, neither sides nor back
 
 
-def test_nobody_sees_the_corridor_behind_the_block():
-    ring = RingCorridor((0.0, 0.0), (20.0, 12.0), width_m=3.0)
-    scene = ring(np.random.default_rng(0))
+def test_nobody_sees_the_corridor_behind_a_block():
+    scene = CorridorGrid(nodes=(2, 2), spacing_m=20.0, cupboards=0)(np.random.default_rng(0))
     seen = scene.points[scene.seen_from(np.array([10.0, 0.0, 0.0]), np.arange(len(scene.points)))]
     # past the block's corner 8.5 m along and 1.5 m aside to the outer wall 11.5 m along
     assert seen[:, 1].max() == pytest.approx(1.5 * 11.5 / 8.5, abs=0.1)
     assert not ((seen[:, 1] > 1.5 + 1e-9) & (np.abs(seen[:, 0] - 10.0) < 8.0)).any()
+
+
+def test_no_point_lies_under_a_block_or_behind_a_cupboard():
+    scene = CorridorGrid(nodes=(2, 3), spacing_m=10.0)(np.random.default_rng(0))
+    flat = np.abs(scene.points[:, 2] + 1.0) < 1e-12
+    under = flat & (scene.points[:, 0] > 1.5) & (scene.points[:, 0] < 8.5) & (scene.points[:, 1] % 10 > 1.5)
+    assert not (under & (scene.points[:, 1] % 10 < 8.5)).any()
 
 
 def test_furniture_leaves_the_middle_free():
