@@ -118,7 +118,7 @@ def colmap(matched: Matched, near: Floats, seed: int) -> list[Pose]:
     import pycolmap
 
     focal = pixels_a_unit(matched)
-    camera = pycolmap.Camera.create(0, pycolmap.CameraModelId.SIMPLE_PINHOLE, focal, 0, 0)
+    camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId.SIMPLE_PINHOLE, focal, 0, 0)
     camera.params = np.array([focal, 0.0, 0.0])
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose, options.min_num_inliers = True, LEAST

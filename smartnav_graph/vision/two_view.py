@@ -40,6 +40,7 @@ from smartnav_graph.vision.refine import (
     transfer,
 )
 from smartnav_graph.vision.selection import Explained, by_chance, choose, hardly_moves, stands_still
+from smartnav_graph.vision.uncertainty import covariance
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -59,7 +60,6 @@ SETTLING = 5
 LARGEST_SAY, TIMES_THE_MEAN = 0.3, 4.0  # of one match in the pose; the mean say is unknowns / matches
 TRIED = 4  # iterations that show which start is the best
 TURN_SPREAD = 3.0  # sigmas: how far a rotation found without a baseline may be off for the two-match start
-LARGEST_CONDITION = 1e12  # of the scaled information: more is a direction the matches leave open
 
 
 @dataclass(frozen=True)
@@ -189,15 +189,15 @@ def _explained(fit: Fit, prior: RotationPrior | None) -> Explained:
 def _told(kind: Kind, reason: str, matched: Matched, state: State, prior: RotationPrior | None) -> TwoView:
     """Settle the inliers of a model and tell its pose, or why not."""
     inliers, fit = _settled(MODELS["rotation" if kind == "static" else kind], matched, state, prior)
-    covariance = None if fit is None else _covariance(fit.information)
+    spread = None if fit is None else covariance(kind, matched.only(inliers), fit, prior)
     refused = _refused(kind, matched, int(inliers.sum()), fit, prior)
-    if refused or fit is None or covariance is None:
+    if refused or fit is None or spread is None:
         return _failed(len(inliers), refused or "the matches leave a direction of the pose open")
     R, t = fit.state[0], fit.state[1] if len(fit.state) > 1 else np.zeros(3)
     freedom = fit.residual.size + (0 if prior is None else 3) - len(fit.information)
     chi2 = float(fit.square.sum()) + _deviation(R, prior)
     angle = float(np.median(parallax(matched.only(inliers), R)))
-    return TwoView(kind, reason, R, t, covariance, inliers, chi2 / freedom, angle)
+    return TwoView(kind, reason, R, t, spread, inliers, chi2 / freedom, angle)
 
 
 def _refused(kind: Kind, matched: Matched, agree: int, fit: Fit | None, prior: RotationPrior | None) -> str:
@@ -246,20 +246,6 @@ def _unchecked(fit: Fit) -> Bools:
     known = np.linalg.pinv(fit.information, hermitian=True)
     say = np.einsum("mkp,pq,mkq->m", fit.jacobian, known, fit.jacobian)
     return np.asarray(say > max(LARGEST_SAY, TIMES_THE_MEAN * len(known) / len(say)))
-
-
-def _covariance(information: Floats) -> Floats | None:
-    """Covariance (5, 5) of rotation and direction; None where a combination of the unknowns is open."""
-    scale = np.sqrt(np.diag(information))
-    if not (scale > 0).all():
-        return None
-    scaled = information / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > LARGEST_CONDITION:
-        return None
-    known = (np.linalg.inv(scaled) / np.outer(scale, scale))[:5, :5]
-    out = np.diag(np.full(5, np.inf))
-    out[: len(known), : len(known)] = known
-    return out
 
 
 def _failed(m: int, reason: str) -> TwoView:
