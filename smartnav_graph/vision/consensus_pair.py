@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.vision.epipolar import rays
-from smartnav_graph.vision.refine import GATE, Matched
+from smartnav_graph.vision.refine import GATE, Matched, angle
 
 Floats = NDArray[np.float64]
 Pose = tuple[Floats, Floats]  # c0_R_c1 (3, 3), c0_t_c1 (3,) of unit length
@@ -108,7 +107,7 @@ def magsac(matched: Matched, near: Floats, seed: int) -> list[Pose]:
     if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
         return []
     first, second, t = cv2.decomposeEssentialMat(E)
-    R = min(first.T, second.T, key=lambda turn: float(Rotation.from_matrix(near.T @ turn).magnitude()))
+    R = min(first.T, second.T, key=lambda turn: angle(near.T @ turn))
     return [(np.asarray(R), np.asarray(-R @ t.ravel()))]
 
 

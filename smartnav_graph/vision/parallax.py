@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.vision.epipolar import cross, rays
-from smartnav_graph.vision.refine import Matched
+from smartnav_graph.vision.refine import Matched, angle
 
 Floats = NDArray[np.float64]
 
@@ -49,6 +49,6 @@ def faced(matched: Matched, R: Floats, t: Floats, *, known_rotation: bool) -> tu
     poses = [(turn, side * t) for turn in turns for side in (1.0, -1.0)]
     votes = [float(in_front(matched, *pose).sum()) for pose in poses]
     least = max(votes) - ALIKE * len(matched.sigma)
-    angles = [float(Rotation.from_matrix(pose[0]).magnitude()) for pose in poses]
+    angles = [angle(pose[0]) for pose in poses]
     best = min(range(len(poses)), key=lambda k: (votes[k] < least, round(angles[k], 9), -votes[k]))
     return poses[best]

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.vision.consensus_pair import pixels_a_unit, usac
 from smartnav_graph.vision.epipolar import rays
@@ -24,6 +23,7 @@ from smartnav_graph.vision.refine import (
     Matched,
     Plane,
     RotationPrior,
+    angle,
     minimise,
     transfer,
 )
@@ -31,8 +31,8 @@ from smartnav_graph.vision.refine import (
 Floats = NDArray[np.float64]
 
 LEAST_PLANAR = 6  # matches: eight unknowns and four to judge them by
-ROUGHLY = 2.0  # times the gate, before the pose is refined
 LEAST_SHARE_OF_PLANE = 0.6  # of the coplanar matches: with fewer on it no plane explains more than depth does
+TURNED = 1e-3  # rad by which two poses differ
 CLEARLY_BETTER = 9.0  # difference of squared misses, 3 sigmas
 
 
@@ -51,7 +51,7 @@ def fit_plane(
     if H is None:
         return None
     miss, _ = transfer(H, matched)
-    near = np.einsum("mk,mk->m", miss, miss) < ROUGHLY**2 * GATE_SQUARE[2]
+    near = np.einsum("mk,mk->m", miss, miss) < GATE_SQUARE[2]
     if near[coplanar].sum() < LEAST_SHARE_OF_PLANE * coplanar.sum():
         return None
     fits = [minimise(Plane(matched), start, reach=REACH, prior=prior) for start in _poses(H, matched)]
@@ -91,10 +91,8 @@ def _chosen(fits: list[Fit], matched: Matched) -> PlanarFit:
     """Of the poses of a plane the one that what lies off the plane, or the prior, speaks for; else the smaller turn."""
     costs = [2.0 * fit.cost + _off_plane(fit, matched) for fit in fits]
     alike = [fit for fit, cost in zip(fits, costs, strict=True) if cost < min(costs) + CLEARLY_BETTER]
-    turns = [Rotation.from_matrix(fit.state[0]) for fit in alike]
-    best = int(np.argmin([turn.magnitude() for turn in turns]))
-    twin = any((turns[best].inv() * turn).magnitude() > 1e-3 for turn in turns)
-    return PlanarFit(alike[best], twin)
+    best = min(alike, key=lambda fit: angle(fit.state[0]))
+    return PlanarFit(best, any(angle(best.state[0].T @ fit.state[0]) > TURNED for fit in alike))
 
 
 def _off_plane(fit: Fit, matched: Matched) -> float:

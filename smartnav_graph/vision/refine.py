@@ -85,6 +85,11 @@ def tangent_basis(t: Floats) -> Floats:
     return np.array([u, v]).T
 
 
+def angle(R: Floats) -> float:
+    """Angle rad of a rotation (3, 3)."""
+    return math.acos(min(max(0.5 * (float(np.trace(R)) - 1.0), -1.0), 1.0))
+
+
 def turned(R: Floats, w: Floats) -> Floats:
     """R Exp(w)."""
     return np.asarray(R @ Rotation.from_rotvec(w).as_matrix())

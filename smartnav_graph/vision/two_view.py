@@ -58,7 +58,7 @@ MOST_BY_CHANCE = 0.05  # sets of agreeing matches expected among wrong ones
 MOST_DEVIATION = 3.5  # sigmas of the gyro's rotation
 SETTLING = 5
 LARGEST_SAY, TIMES_THE_MEAN = 0.3, 4.0  # of one match in the pose; the mean say is unknowns / matches
-TRIED = 4  # iterations that show which start is the best
+TRIED = 3  # iterations that show which start is the best
 TURN_SPREAD = 3.0  # sigmas: how far a rotation found without a baseline may be off for the two-match start
 
 
