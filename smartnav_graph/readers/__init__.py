@@ -107,8 +107,17 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
     if is_archive(Path(source)):
         with unpacked(Path(source)) as inside:
             source = _entry(inside)
-            return find(source, name).read(source, repairs=repairs).replace(pictures=None)  # they are gone with it
+            return _without_pictures(find(source, name).read(source, repairs=repairs))
     return find(source, name).read(source, repairs=repairs)
+
+
+def _without_pictures(found: Session) -> Session:
+    """The session of an archive: its pictures are gone with the unpacked folder, which is told where there were any."""
+    folder = found.pictures
+    files = [] if found.images is None or folder is None else [f for f in map(str, found.images.file) if f]
+    lost = sum((folder / file).is_file() for file in files) if folder is not None else 0
+    told = {"images": {"pictures left in the archive (unpack it, and import the folder)": lost}} if lost else {}
+    return found.replace(pictures=None, dropped={**found.dropped, **told})
 
 
 def _entry(folder: Path) -> Path:

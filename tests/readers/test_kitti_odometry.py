@@ -1,5 +1,7 @@
 """KITTI odometry: golden rows of the public sequence, axes, and faulty folders."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -56,6 +58,13 @@ def test_a_saved_session_has_its_pictures(folder, tmp_path):
     again = load(tmp_path / "session")
     for file in again.images.file:
         assert (again.pictures / file).read_bytes() == (folder / "image_0" / file).read_bytes()
+
+
+def test_pictures_in_an_archive_are_told(folder):
+    archive = shutil.make_archive(str(folder.parent / "packed"), "zip", folder.parent, "seq")
+    session = readers.read(archive)
+    assert session.pictures is None and len(session.images) == 2
+    assert session.dropped == {"images": {"pictures left in the archive (unpack it, and import the folder)": 2}}
 
 
 @pytest.mark.parametrize(
