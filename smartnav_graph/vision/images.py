@@ -127,16 +127,17 @@ def look(picture: Picture, camera: Camera | None) -> Look:
 
 
 def decoded(data: bytes) -> Gray | None:
-    """Grey levels (h, w) of the bytes of a picture; None where it is cut short or no picture.
+    """Grey levels (h, w) of the bytes of a picture, as the sensor read it; None where it is cut short or no picture.
 
-    OpenCV fills the lost part of a truncated file with grey, so that the end of the file is looked for first.
+    OpenCV fills the lost part of a truncated file with grey, so that the end of the file is looked for first. How a
+    viewer should turn the picture (EXIF) is not followed: cameras are calibrated and mounted by their sensor's axes.
     """
     if not _is_whole(data):
         return None
     import cv2
 
     try:
-        found: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        found: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
     return None if found is None else np.asarray(found, dtype=np.uint8)

@@ -39,6 +39,16 @@ def test_what_a_camera_appends_to_a_jpeg_does_no_harm():
     assert images.decoded(nested[: len(thumbnail) + 200]) is None
 
 
+def test_the_way_a_phone_was_held_does_not_turn_the_picture():
+    data = jpeg(PICTURE)
+    tag = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"  # orientation 6: to be shown turned by 90 degrees
+    exif = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01" + tag + b"\x00\x00\x00\x00"
+    held = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    turned = cv2.imdecode(np.frombuffer(held, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert turned.shape == PICTURE.shape[::-1]  # so it is an orientation that OpenCV knows
+    np.testing.assert_array_equal(images.decoded(held), images.decoded(data))
+
+
 def test_no_picture_at_all():
     assert images.decoded(b"") is None
     assert images.decoded(b"\x89PNG nothing of the kind IEND") is None
