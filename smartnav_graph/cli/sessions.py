@@ -73,21 +73,29 @@ class Info(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Writing):
-    """A named simulated session; its truth stands in reference.parquet.
+    """A named simulated session; its truth stands in reference.parquet. Its constants are printed.
 
     Example: smartnav simulate walk-60s --seed 1 --out walk
+
+    room-30s has tracks, trolley-20min matches of images that were never taken, rendered-room-10s pictures. They start
+    at rest in the origin, facing north, which is what a start without fixes takes for granted.
     """
 
     scenario: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
-    """For example walk-60s, car-10min, trolley-loop; a wrong name lists them all."""
+    """For example walk-60s, car-10min, trolley-20min; a wrong name lists them all."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of every random draw."""
 
     def run(self) -> None:
-        from smartnav_graph.simulation import scenarios
+        from smartnav_graph.simulation import recording, scenarios
 
         check_out(self.out, self.force)
-        save(scenarios.simulate(self.scenario, self.seed), self.out, self.force)
+        scenario = scenarios.named(self.scenario)
+        session = recording.write(scenario, self.seed, self.out, force=self.force)
+        for name, value in recording.constants(scenario).items():
+            print(f"{name} = {value}")
+        print(session_text(session))
+        print(f"session: {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from smartnav_graph.session import Mount
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
 from smartnav_graph.streams import Images, Matches, Tracks
+from smartnav_graph.timebase import NS
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -58,13 +59,35 @@ class Faults:
             raise ConfigError("camera", f"outliers {self.outliers}, lost {self.lost}", "shares from 0 to below 1")
 
 
+@dataclass(frozen=True)
+class PictureModel:
+    """How pictures are taken.
+
+    texels_per_m : fineness of the textures; exposure_s : 0 for no blur, else the mean of `blur_steps` pictures;
+    noise : sigma of a pixel in grey levels of 255; contrast : of the textures, 1 uses all grey levels
+    """
+
+    texels_per_m: float = 160.0
+    exposure_s: float = 0.0
+    blur_steps: int = 8
+    noise: float = 2.0
+    contrast: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not (self.texels_per_m > 0 and self.exposure_s >= 0 and self.noise >= 0 and 0 < self.contrast <= 1):
+            raise ConfigError("pictures", f"{self}", "texels and contrast (up to 1) > 0, the rest >= 0")
+        if self.blur_steps < 2:
+            raise ConfigError("pictures", f"blur_steps = {self.blur_steps}", "at least 2")
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraModel:
     """A camera and what is kept of its images.
 
     camera, mount : as the session is told; rate_hz : of images; scene : made anew for each seed
     count : fewest and most features of a pair (matches) or a frame (tracks); pairs : spans between the images of a
-    pair, () for no matches; tracked : tracks too; range_m : nearest and farthest point that is seen
+    pair, () for no matches; tracked : tracks too; pictures : rendered ones
+    range_m : nearest (depth) and farthest point that is seen
     boresight_deg : the true axes are body_R_cam Exp(boresight), degrees about the optical axes; clock_s : a frame
     shows the world so much later than the session is told
     """
@@ -77,6 +100,7 @@ class CameraModel:
     count: tuple[int, int] = (20, 60)
     pairs: tuple[int, ...] = ()
     tracked: bool = False
+    pictures: PictureModel | None = None
     range_m: Range = (0.3, 15.0)
     faults: Faults = Faults()
     boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -121,14 +145,34 @@ def take(
     model: CameraModel, trajectory: Trajectory, t_ns: Times, t: Floats, scene: Scene, rng: np.random.Generator
 ) -> Taken:
     """Images at the stamps t_ns (n,), at times t (n,) s of the trajectory, and the features in them."""
+    images = _images(model, t_ns)
+    if not (model.pairs or model.tracked):
+        return Taken(images, None, None)
     views = [view(model, trajectory, scene, float(at)) for at in t]
     jumps = _jumps(model, t, rng)
     blind = _blind(model, t)
-    file, name = (np.full(len(t), text, dtype=object) for text in ("", model.name))
-    images = Images(t_ns=t_ns, image_id=np.arange(len(t)), file=file, camera=name)
     views = [View(v.rows[:0], v.xy_px[:0]) if dark else v for v, dark in zip(views, blind, strict=True)]
     matches = _matches(model, views, jumps, t_ns, rng) if model.pairs else None
     return Taken(images, matches, _tracks(model, views, jumps, t_ns, rng) if model.tracked else None)
+
+
+def file_name(image_id: int) -> str:
+    """Name of a picture in the session's images folder."""
+    return f"{image_id:06d}.png"
+
+
+def _images(model: CameraModel, t_ns: Times) -> Images:
+    ids = np.arange(len(t_ns))
+    files = [file_name(i) if model.pictures else "" for i in range(len(ids))]
+    exposure, readout = model.pictures.exposure_s if model.pictures else 0.0, model.camera.readout_s
+    return Images(
+        t_ns=t_ns,
+        image_id=ids,
+        file=np.array(files, dtype=object),
+        camera=np.full(len(ids), model.name, dtype=object),
+        exposure_ns=np.full(len(ids), round(NS * exposure)) if exposure else None,
+        readout_ns=np.full(len(ids), round(NS * readout)) if readout else None,
+    )
 
 
 def view(model: CameraModel, trajectory: Trajectory, scene: Scene, t: float) -> View:

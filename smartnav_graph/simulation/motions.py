@@ -97,6 +97,17 @@ _CASTORS = (
 )
 
 
+def creep(rng: np.random.Generator, speed: float, rate: float) -> tuple[Sway, ...]:
+    """How what stands gives way over minutes: `speed` m/s an axis and `rate` rad/s in yaw, root mean square each; from
+    where it was put."""
+    waves = []
+    for hertz in (1 / 90, 1 / 160, 1 / 310):
+        size = np.sqrt(2.0 / 3.0) / (2 * np.pi * hertz) * rng.choice([-1.0, 1.0], 4)
+        right, ahead, up = (float(speed * value) for value in size[:3])
+        waves.append(Sway(hertz, (right, ahead, up), (float(rate * size[3]), 0.0, 0.0)))
+    return tuple(waves)
+
+
 @dataclass(frozen=True)
 class Corridors:
     """A trolley pushed along the corridors of a grid, turned on the spot where they cross, from a long rest.
@@ -105,7 +116,7 @@ class Corridors:
     told. Between two crossings it takes `drive_s` seconds, speeding up and slowing down within `ramp_s`. Each word of
     `turns` is the way to the next stop of `stop_s`: at every letter it halts, turns by 90 deg to the left (L) or right
     (R) within `turn_s`, halts again, each time for `halt_s`, and drives on. Nothing that people lean on is quite at
-    rest: `fidget_m_s` is the speed left an axis, root mean square.
+    rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the speeds left an axis, root mean square.
     """
 
     turns: tuple[str, ...] = ("LRL", "RRL", "LLL", "RRL", "LLL", "RRR", "RLL", "LLR", "LRR", "LRR")
@@ -116,7 +127,9 @@ class Corridors:
     turn_s: float = 4.0
     halt_s: float = 0.8
     speed_m_s: float = 1.0
-    fidget_m_s: float = 5e-4
+    fidget_m_s: float = 4e-4
+    creep_m_s: float = 3e-4
+    creep_rad_s: float = 1e-4
     sway: tuple[Sway, ...] = _CASTORS
 
     @property
@@ -132,7 +145,7 @@ class Corridors:
             for letter in word:
                 legs += [*self._drive(), halt, Leg(self.turn_s, 0.0, 90.0 if letter == "L" else -90.0), halt]
             legs += [*self._drive(), Leg(self.stop_s, 0.0)]
-        fidget = slip(rng, self.fidget_m_s, axes=(0, 1, 2))
+        fidget = slip(rng, self.fidget_m_s, axes=(0, 1, 2)) + creep(rng, self.creep_m_s, self.creep_rad_s)
         return Trajectory(Legs(legs), sway=self.sway, sway_speed=self.speed_m_s, fidget=fidget)
 
     def _drive(self) -> list[Leg]:

@@ -6,18 +6,24 @@ inertial samples, flat ENU frame at 52 N, 11 E, 100 m, gravity constant and stra
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import frames
+from smartnav_graph import session as session_model
 from smartnav_graph.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.files import replacing
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.session import Device, Mount, Session
-from smartnav_graph.simulation import cameras, fixes, sensors
+from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import CameraModel
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
@@ -63,7 +69,7 @@ class Scenario:
 # Every purpose has random numbers of its own: a new sensor is added at the end and leaves the others as they were.
 PURPOSES = (
     *("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes"),
-    *("scene", "camera"),
+    *("scene", "camera", "texture", "pictures"),
 )
 
 
@@ -89,10 +95,15 @@ class _Ride:
         return slice(None, None, round(RATE_HZ / rate_hz))
 
 
-def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
+def _ride(scenario: Scenario, seed: int) -> _Ride:
     trajectory = scenario.motion(scenario.seconds, np.random.default_rng((seed, 0)))
     t = np.arange(round(scenario.seconds * RATE_HZ)) / RATE_HZ
-    ride = _Ride(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
+    return _Ride(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
+
+
+def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
+    ride = _ride(scenario, seed)
+    trajectory, t = ride.trajectory, ride.t
     profile = PROFILES[scenario.profile]
     imu, biases = sensors.imu(ride.truth, ride.t_ns, profile.noise, _gravity(), ride.rng("imu"))
     streams: dict[str, Stream | None] = {
@@ -153,6 +164,47 @@ def _camera(ride: _Ride, model: CameraModel | None) -> dict[str, Stream | None]:
     t_ns, t = ride.t_ns[every], ride.t[every]
     taken = cameras.take(model, ride.trajectory, t_ns, t, scene, ride.rng("camera"))
     return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
+
+
+def write(scenario: Scenario, seed: int, path: str | Path, *, force: bool = False) -> Session:
+    """The scenario's session as a folder, with its pictures where it renders some; gives the session.
+
+    Pictures exist on disk only: a session in memory has their names.
+
+    Raises
+    ------
+    SessionError
+        `path` exists and `force` is not given, or the system refuses to write.
+    """
+    recorded = scenario(seed)
+    with replacing(path, force=force) as folder:
+        session_model.save(recorded, folder)
+        if scenario.camera is not None and scenario.camera.pictures is not None:
+            render.write(folder / "images", shots(scenario, seed))
+    return recorded
+
+
+def shots(scenario: Scenario, seed: int) -> Iterator[render.Grey]:
+    """The pictures (h, w) of a scenario that renders some, one an image of its session."""
+    model, ride = scenario.camera, _ride(scenario, seed)
+    if model is None or model.pictures is None:
+        raise ConfigError("simulate", f"{scenario.name} renders no pictures", "a scenario whose camera does")
+    painted = render.Painted.of(model.scene(ride.rng("scene")), model.pictures, ride.rng("texture"))
+    t = ride.t[ride.rows(model.rate_hz)]
+    yield from render.pictures(model, ride.trajectory, painted, t, model.pictures, ride.rng("pictures"))
+
+
+def constants(scenario: Scenario) -> dict[str, Any]:
+    """Every constant of a scenario by its dotted name, and the noise of its device: what makes it, but for the seed."""
+    noise = dataclasses.asdict(PROFILES[scenario.profile].noise)
+    return _flat("", dataclasses.asdict(scenario) | {"noise": noise})
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    if isinstance(value, dict):
+        parts = [_flat(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
+        return {key: inner for part in parts for key, inner in part.items()}
+    return {} if value is None else {name: getattr(value, "__name__", value)}
 
 
 def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:

@@ -11,7 +11,7 @@ from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.session import Mount, Session
 from smartnav_graph.simulation import motions
-from smartnav_graph.simulation.cameras import LOOKING_AHEAD, CameraModel, Faults
+from smartnav_graph.simulation.cameras import LOOKING_AHEAD, CameraModel, Faults, PictureModel
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.recording import Scenario
 from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
@@ -79,6 +79,7 @@ _ROOM = CameraModel(
     tracked=True,
     faults=Faults(lost=0.01),
 )
+_RENDERED = replace(_ROOM, tracked=False, pictures=PictureModel())
 _TROLLEY = motions.Corridors()
 _CORRIDORS = CameraModel(
     camera=PHONE_CAMERA,
@@ -124,6 +125,7 @@ SCENARIOS: dict[str, Scenario] = {
             control=True,
             **_ALL_SENSORS,
         ),
+        Scenario("rendered-room-10s", 10.0, motions.in_a_room, profile="galaxy-s2", camera=_RENDERED),
         Scenario("room-30s", 30.0, motions.in_a_room, profile="galaxy-s2", camera=_ROOM),
         Scenario(
             "trolley-20min", 1200.0, _TROLLEY, profile="galaxy-s2-warming", camera=_CORRIDORS, rest_sigma_m_s=5e-4
@@ -146,6 +148,17 @@ def simulate(name: str, seed: int = 0, *, calibrated: bool = True) -> Session:
     ConfigError
         Unknown name.
     """
+    return named(name)(seed, calibrated=calibrated)
+
+
+def named(name: str) -> Scenario:
+    """The scenario of this name.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name.
+    """
     if name not in SCENARIOS:
         raise ConfigError("simulate", f"scenario {name!r}", f"one of {', '.join(SCENARIOS)}")
-    return SCENARIOS[name](seed, calibrated=calibrated)
+    return SCENARIOS[name]
