@@ -3,8 +3,8 @@
     two_view(xy0, xy1, sigma) -> TwoView
 
 1. The best rotation without a baseline is sought; points that stay where they were are static: no more is fitted.
-2. A first pose comes from one of `METHODS`, and another one from two matches once the rotation is held; each is refined
-   on all matches under a redescending loss, and the one of least cost goes on.
+2. A first pose comes from one of `METHODS`, and another one from two matches once the rotation is known, or else from
+   a camera that goes straight ahead; the better one is refined on all matches under a redescending loss.
 3. A plane is fitted likewise; rotation, plane and general pose are weighed (`selection`).
 4. Inliers are settled, the pose refined by least squares on them, with the gyro's rotation as one more measurement.
 
@@ -58,8 +58,8 @@ MOST_BY_CHANCE = 0.05  # sets of agreeing matches expected among wrong ones
 MOST_DEVIATION = 3.5  # sigmas of the gyro's rotation
 SETTLING = 5
 LARGEST_SAY, TIMES_THE_MEAN = 0.3, 4.0  # of one match in the pose; the mean say is unknowns / matches
+TURNING = 6  # iterations that a rotation needs if there is no more to it
 TRIED = 3  # iterations that show which start is the best
-TURN_SPREAD = 3.0  # sigmas: how far a rotation found without a baseline may be off for the two-match start
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def two_view(
         raise ConfigError("two-view geometry", "method gyro without a rotation prior", "one", "give it, or use magsac")
     if len(matched.sigma) < LEAST:
         return _failed(len(matched.sigma), f"{len(matched.sigma)} matches; at least {LEAST} are needed")
-    turn = minimise(Turn(matched), (turns(matched, seed),), reach=REACH, prior=prior)
+    turn = minimise(Turn(matched), (turns(matched, seed),), reach=REACH, prior=prior, iterations=TURNING)
     at_rest, _ = transfer(np.eye(3), matched)
     still = np.einsum("mk,mk->m", at_rest, at_rest)
     if stands_still(still):
@@ -169,10 +169,11 @@ def _checked(xy0: Floats, xy1: Floats, sigma: float | Floats) -> Matched:
 def _general(matched: Matched, method: str, prior: RotationPrior | None, seed: int, turn: Fit) -> Fit:
     """The general pose of least cost, from all starts; turned and signed as it comes."""
     model, near = Epipolar(matched), turn.state[0] if prior is None else prior.c0_R_c1
-    spread = TURN_SPREAD * float(np.median(matched.sigma)) if prior is None else prior.sigma
-    starts = [*METHODS[method](matched, near, seed), directions(matched, near, spread, seed)]
+    starts = METHODS[method](matched, near, seed)
     if prior is None:  # going ahead and turning aside from a sideways baseline look alike: where one is, try the other
         starts.append((near, OPTICAL_AXIS))
+    else:
+        starts.append(directions(matched, near, prior.sigma, seed))
     tried = [minimise(model, start, reach=REACH, prior=prior, iterations=TRIED) for start in starts]
     return minimise(model, min(tried, key=lambda fit: fit.cost).state, reach=REACH, prior=prior)
 
