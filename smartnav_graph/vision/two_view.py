@@ -49,7 +49,7 @@ Kind = Literal["static", "rotation", "planar", "general", "failed"]
 METHODS: dict[str, Callable[[Matched, Floats, int], list[Pose]]] = {
     "magsac": magsac,
     "colmap": colmap,
-    "gyro": lambda matched, near, seed: [],  # the two-match start, which all methods have, is its only one
+    "gyro": lambda matched, near, seed: [],  # two matches and the prior, which all methods try, are all it has
 }
 MODELS: dict[str, Callable[[Matched], Model]] = {"rotation": Turn, "planar": Plane, "general": Epipolar}
 # Matches that fix a pose, and with the rotation known.

@@ -1,0 +1,180 @@
+"""Pose fixes from a map: a COLMAP reconstruction of which some images are the session's own.
+
+The poses of a reconstruction (`cam_from_world`, a spelling confined to this module) are turned into poses of the body
+through the camera's mount, and its scale and frame are found from positions the caller knows: fixes, surveyed points,
+or a solution made without the map.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.errors import SessionError
+from smartnav_graph.session import Session
+from smartnav_graph.streams import Images, PoseFix
+from smartnav_graph.timebase import NS, interpolate
+from smartnav_graph.vision.similarity import Similarity, align
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Floats = NDArray[np.float64]
+
+SOURCE = "colmap"
+EXAMPLES = 3  # names that an error tells
+
+
+class Known(NamedTuple):
+    """Positions of the body known without the map: t_ns (k,) ascending, nav_t_body (k, 3) m; interpolated between two
+    of them that are at most `longest_gap_s` apart."""
+
+    t_ns: NDArray[np.int64]
+    nav_t_body: Floats
+    longest_gap_s: float = 2.0
+
+
+@dataclass(frozen=True)
+class MapFixes:
+    """Pose fixes with the similarity they were laid on nav by.
+
+    counts : images of the map that are ``used``, ``aligned`` (of them, with a known position), ``unregistered``
+        (without a pose), ``unknown`` (no image of the session has their name)
+    """
+
+    fixes: PoseFix
+    similarity: Similarity
+    counts: Mapping[str, int]
+
+
+def pose_fixes(
+    reconstruction: str | Path | pycolmap.Reconstruction,
+    session: Session,
+    known: Known,
+    *,
+    least_sigma_m: float = 0.01,
+    least_sigma_deg: float = 0.1,
+) -> MapFixes:
+    """Poses of the body from those a reconstruction has of the session's images.
+
+    Parameters
+    ----------
+    reconstruction : as pycolmap has it, or the folder it was written to
+    session : of which images, mounts and the cameras' time offsets are used
+    known : positions that tell scale and frame
+    least_sigma_m, least_sigma_deg : floors of the sigmas, which come from how well the known positions fit
+
+    Returns
+    -------
+    MapFixes; rows in time order, one an image of the map that is the session's.
+
+    Raises
+    ------
+    SessionError
+        No such reconstruction; the session has no images; no image of the map is the session's.
+    SolverError
+        Too few images have a known position, or these lie on a line.
+    """
+    where = "reconstruction" if not isinstance(reconstruction, str | Path) else str(reconstruction)
+    if session.images is None:
+        raise SessionError(session.path or "session", "no images", "an images stream", "import the pictures")
+    opened = _opened(reconstruction)
+    registered = _registered(opened)
+    rows = _rows(registered, session.images, where)
+    poses = _poses(registered, rows, session)
+    placed, there = _known_at(known, poses.t_ns)
+    found = align(poses.centres[there], poses.lever[there], placed[there], where)
+    counts = {"used": len(rows), "aligned": int(there.sum()), "unknown": len(registered) - len(rows)}
+    counts["unregistered"] = len(opened.images) - len(registered)
+    turns = Rotation.from_matrix(found.nav_R_map @ poses.map_R_body).as_quat(canonical=True)
+    fixes = PoseFix(
+        t_ns=poses.t_ns,
+        enu=found.positions(poses.centres, poses.lever),
+        sigma=np.full((len(rows), 3), max(found.sigma, least_sigma_m)),
+        quat=np.roll(turns, 1, axis=1),
+        sigma_rot=np.tile(np.hypot(found.turn_sigma, np.radians(least_sigma_deg)), (len(rows), 1)),
+        source=np.full(len(rows), SOURCE, dtype=object),
+    )
+    return MapFixes(fixes, found, counts)
+
+
+def _opened(reconstruction: str | Path | pycolmap.Reconstruction) -> Any:
+    if not isinstance(reconstruction, str | Path):
+        return reconstruction
+    import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(str(reconstruction))
+    except (ValueError, RuntimeError, OSError) as error:
+        told = str(error).split("] ", 1)[-1]
+        expected = "a folder with cameras, images and points3D (.bin or .txt)"
+        raise SessionError(reconstruction, f"cannot be read ({told})", expected) from error
+
+
+def _registered(reconstruction: Any) -> dict[str, Floats]:
+    """map_T_cam (4, 4) of the images that have a pose, by name."""
+    images = [image for image in reconstruction.images.values() if image.has_pose]
+    poses = [image.cam_from_world().inverse().matrix() for image in images]
+    return {image.name: np.vstack([pose, [0.0, 0.0, 0.0, 1.0]]) for image, pose in zip(images, poses, strict=True)}
+
+
+def _rows(registered: Mapping[str, Floats], images: Images, where: str) -> dict[str, int]:
+    """Row of the session's image of each name, in time order: the same path, or the only file of that name."""
+    paths = {str(file): row for row, file in enumerate(images.file)}
+    last = Counter(Path(path).name for path in paths)
+    names = {Path(path).name: row for path, row in paths.items() if last[Path(path).name] == 1}
+    found = {name: paths.get(name, names.get(Path(name).name, -1)) for name in registered}
+    unknown = sorted(name for name, row in found.items() if row < 0)
+    if len(unknown) == len(found):
+        told = f"none of its {len(found)} registered images is the session's"
+        told += f" (such as {', '.join(unknown[:EXAMPLES])})" if unknown else ""
+        raise SessionError(where, told, f"names such as {', '.join(list(paths)[:EXAMPLES])}", "name the files alike")
+    rows = {name: row for name, row in found.items() if row >= 0}
+    return dict(sorted(rows.items(), key=lambda item: images.t_ns[item[1]]))
+
+
+class _Poses(NamedTuple):
+    """IMU times (n,), camera centres (n, 3) in map units, map_R_body (n, 3, 3), map_R_body body_t_cam (n, 3) m."""
+
+    t_ns: NDArray[np.int64]
+    centres: Floats
+    map_R_body: Floats
+    lever: Floats
+
+
+def _poses(registered: Mapping[str, Floats], rows: Mapping[str, int], session: Session) -> _Poses:
+    """Poses of the session's images."""
+    assert session.images is not None
+    cameras = {} if session.calibration is None else session.calibration.cameras
+    names = [str(session.images.camera[row]) for row in rows.values()]
+    offset_ns = [round(cameras[name].time_offset_s * NS) if name in cameras else 0 for name in names]
+    body_R_cam = np.array([session.mount(name).body_R for name in names])
+    body_t_cam = np.array([session.mount(name).body_t for name in names])
+    map_T_cam = np.array([registered[name] for name in rows])
+    map_R_body = map_T_cam[:, :3, :3] @ body_R_cam.transpose(0, 2, 1)
+    lever = (map_R_body @ body_t_cam[:, :, None])[:, :, 0]
+    stamps = session.images.t_ns[list(rows.values())] + np.array(offset_ns, dtype=np.int64)
+    return _Poses(stamps, map_T_cam[:, :3, 3], map_R_body, lever)
+
+
+def _known_at(known: Known, t_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Known positions (n, 3) at times (n,), and which of them are there."""
+    at = np.asarray(known.t_ns, dtype=np.int64)
+    if known.nav_t_body.shape != (len(at), 3) or not np.isfinite(known.nav_t_body).all() or (np.diff(at) <= 0).any():
+        found = f"{len(at)} times and positions {known.nav_t_body.shape}"
+        raise SessionError("known positions", found, "ascending times and (k, 3) finite metres")
+    if len(at) == 0:
+        return np.zeros((len(t_ns), 3)), np.zeros(len(t_ns), dtype=bool)
+    after = np.searchsorted(at, t_ns)
+    right, left = np.clip(after, 0, len(at) - 1), np.clip(after - 1, 0, len(at) - 1)
+    there = (at[right] == t_ns) | (
+        (after > 0) & (after < len(at)) & (at[right] - at[left] <= round(known.longest_gap_s * NS))
+    )
+    return interpolate(t_ns, at, known.nav_t_body), there
