@@ -11,6 +11,8 @@ replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive tha
                   baseline: scripts/bare_fixed_lag.py
 vision-frontend   101 textured pictures of 640 x 480 with noise from disk, ORB 1500, 100 pairs of neighbours, on all
                   processors (wall seconds); baseline: scripts/bare_front_end.py, OpenCV's own calls in one process
+two-view          one pair of 300 matches, 30 % wrong, to kind, pose and covariance; baseline: scripts/bare_two_view.py,
+                  OpenCV's findEssentialMat and recoverPose alone
 """
 
 from __future__ import annotations
@@ -64,6 +66,11 @@ def bare_front_end(folder: str) -> Measured:
     return Measured(told["seconds"], None, told)
 
 
+def bare_two_view() -> Measured:
+    told = python(str(HERE / "bare_two_view.py"))
+    return Measured(told.pop("seconds"), None, told)
+
+
 def ours(kind: str, session: str) -> Measured:
     told = python(str(HERE / "benchmark.py"), "--measure", kind, session)
     return Measured(told["seconds"], told["peak_memory_mb"], told["detail"])
@@ -73,6 +80,9 @@ def measure(kind: str, path: str) -> None:
     """In the fresh process: one run of a session in memory, told as a JSON line."""
     if kind == "front-end":
         measure_front_end(Path(path))
+        return
+    if kind == "two-view":
+        measure_two_view()
         return
     import smartnav_graph as sn
     from smartnav_graph import estimate  # imports are not measured
@@ -127,6 +137,23 @@ def measure_front_end(folder: Path) -> None:
     tell(seconds, told | {key: getattr(report, key) for key in keys})
 
 
+def measure_two_view() -> None:
+    """In the fresh process: pairs of matched points to relative poses with covariance, one after the other."""
+    import bare_two_view as bare
+    import cv2  # noqa: F401  imports are not measured
+    import numpy as np
+
+    from smartnav_graph.vision.two_view import two_view
+
+    pairs, sigma = [bare.pair(seed) for seed in range(bare.PAIRS)], bare.NOISE_PX / bare.FOCAL
+    begin = time.process_time()
+    found = [two_view(*pair, sigma) for pair in pairs]
+    seconds = time.process_time() - begin
+    assert all(view.kind == "general" and np.isfinite(view.covariance).all() for view in found)
+    figures = bare.told(seconds, [bare.errors_deg(view.c0_R_c1, view.c0_t_c1) for view in found])
+    tell(figures.pop("seconds"), figures)
+
+
 def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
     """A simulated session on disk; a process of its own, so that it costs no memory here."""
     path = folder / f"{scenario}{'' if sigmas else '-without-sigmas'}"
@@ -167,6 +194,8 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
         pictures = folder / "pictures"
         subprocess.run([sys.executable, str(HERE / "bare_front_end.py"), "make", str(pictures)], check=True)
         return lambda: ours("front-end", str(pictures)), lambda: bare_front_end(str(pictures)), {}
+    if name == "two-view":
+        return lambda: ours("two-view", "simulated"), bare_two_view, {}
     return lambda: ours("replay", "gtsam-kitti"), bare_fixed_lag, {}
 
 
@@ -187,7 +216,7 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
     }
 
 
-NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag", "vision-frontend")
+NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag", "vision-frontend", "two-view")
 
 
 def main() -> None:

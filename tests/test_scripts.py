@@ -94,3 +94,11 @@ def test_the_front_end_is_measured_beside_bare_opencv(tmp_path):
     bare = told(scripts / "bare_front_end.py", folder)
     assert ours["pairs"] == bare["pairs"] == 3
     assert ours["matches"] > 1500 and bare["matches"] > 1500  # of 3 x 1500 points
+
+
+def test_two_view_geometry_is_measured_beside_bare_opencv():
+    scripts = ROOT / "scripts"
+    commands = [[scripts / "benchmark.py", "--measure", "two-view", "simulated"], [scripts / "bare_two_view.py"]]
+    runs = [subprocess.run([sys.executable, *c], capture_output=True, text=True, check=True) for c in commands]
+    ours, bare = json.loads(runs[0].stdout)["detail"], json.loads(runs[1].stdout)
+    assert ours["rotation_deg"] < bare["rotation_deg"] and ours["direction_deg"] < 0.8 * bare["direction_deg"]
