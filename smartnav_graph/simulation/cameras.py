@@ -180,7 +180,7 @@ def view(model: CameraModel, trajectory: Trajectory, scene: Scene, t: float) -> 
     camera = model.camera
     begin = t + model.offset_s
     (R,), (centre,) = model.poses(trajectory, np.array([begin + camera.readout_s / 2]))
-    rows = scene.seen_from(centre, _in_sight(model, R, centre, scene.points))
+    rows = scene.seen_from(centre, _in_sight(model, R, centre, scene))
     points = scene.points[rows]
     xy = camera.pixels(_flat((points - centre) @ R))
     for _ in range(_ROW_PASSES if camera.readout_s > 0 else 0):
@@ -196,7 +196,7 @@ def _flat(points: Floats) -> Floats:
     return np.asarray(points[:, :2] / points[:, 2:])
 
 
-def _in_sight(model: CameraModel, R: Floats, centre: Floats, points: Floats) -> Rows:
+def _in_sight(model: CameraModel, R: Floats, centre: Floats, scene: Scene) -> Rows:
     """Points in front, within range, and not far beyond the corners of the image, where distortion would fold them in.
 
     The margin leaves room for what moves while a rolling shutter reads out.
@@ -205,9 +205,8 @@ def _in_sight(model: CameraModel, R: Floats, centre: Floats, points: Floats) -> 
     corners = np.array([[x, y] for x in (0, camera.width - 1) for y in (0, camera.height - 1)], dtype=np.float64)
     widest = 1.1 * np.abs(camera.normalised(corners)).max(axis=0)
     near, far = model.range_m
-    away = points - centre
-    rows = np.flatnonzero(np.einsum("ni,ni->n", away, away) < far**2)
-    seen = away[rows] @ R
+    rows = scene.near(centre, far)
+    seen = (scene.points[rows] - centre) @ R
     inside = (seen[:, 2] > near) & (np.abs(seen[:, :2]) < widest * seen[:, 2:]).all(axis=1)
     return np.asarray(rows[inside], dtype=np.intp)
 

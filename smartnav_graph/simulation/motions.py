@@ -128,8 +128,8 @@ class Corridors:
     halt_s: float = 0.8
     speed_m_s: float = 1.0
     fidget_m_s: float = 4e-4
-    creep_m_s: float = 3e-4
-    creep_rad_s: float = 1e-4
+    creep_m_s: float = 1.5e-4
+    creep_rad_s: float = 3.5e-5
     sway: tuple[Sway, ...] = _CASTORS
 
     @property

@@ -53,6 +53,16 @@ class Scene:
         normal = np.cross(self.u, self.v)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
+    def near(self, centre: Floats, range_m: float) -> Rows:
+        """Points within `range_m` of a place (3,), in their order."""
+        rows = np.flatnonzero(np.abs(self._east - centre[0]) < range_m)
+        away = self.points[rows] - centre
+        return np.asarray(rows[np.einsum("ni,ni->n", away, away) < range_m**2])
+
+    @cached_property
+    def _east(self) -> Floats:
+        return np.ascontiguousarray(self.points[:, 0])
+
     def seen_from(self, centre: Floats, rows: Rows) -> Rows:
         """Those of the points `rows` that no face hides from a camera at `centre` (3,), and that face it."""
         ahead = np.einsum("ni,ni->n", centre - self.points[rows], self.normal[self.face[rows]]) > 0.0

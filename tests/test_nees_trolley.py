@@ -1,0 +1,55 @@
+"""Twenty minutes with a trolley by inertial data and standstills alone: how far off, and honest about it?
+
+The start is known (at rest in the origin, facing north); nothing else tells a position. What vision adds is measured
+against these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_nees import average_nees, errors, outside
+
+import smartnav_graph as sn
+from smartnav_graph.simulation.scenarios import SCENARIOS
+
+ALONE = replace(SCENARIOS["trolley-20min"], camera=None)
+
+
+def rms(seed: int) -> tuple[float, float]:
+    """Root mean square over all keyframes of the position error (m) and of the heading error (deg)."""
+    session = ALONE(seed)
+    solution = sn.smooth(session)
+    known = np.flatnonzero(np.isin(solution.t_ns, session.reference.t_ns))
+    off = np.array([errors(session, solution, int(row)) for row in known])
+    return float(np.sqrt((off[:, 3:6] ** 2).sum(axis=1).mean())), float(np.degrees(np.sqrt((off[:, 2] ** 2).mean())))
+
+
+def test_one_run_is_off_by_metres_and_degrees():
+    position, heading = rms(0)
+    assert 0.3 < position < 4.5 and 0.3 < heading < 12.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_every_run_stays_within_bounds(seed):
+    position, heading = rms(seed)
+    assert position < 4.5 and heading < 12.0
+
+
+@pytest.mark.slow
+def test_covariances_are_honest_over_thirty_runs():
+    assert outside(average_nees(ALONE)) == {}
+
+
+@pytest.mark.slow
+def test_a_gyro_that_drifts_more_than_told_is_caught():
+    def bold(seed: int) -> sn.Session:
+        session = ALONE(seed)
+        noise = replace(session.calibration.imu_noise, gyro_bias_walk=2e-5)
+        return session.replace(calibration=replace(session.calibration, imu_noise=noise))
+
+    bad = outside(average_nees(bold, 8), 8)
+    assert bad["rotation", 0.9] > 1.5
