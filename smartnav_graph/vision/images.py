@@ -7,7 +7,6 @@ at another size, when it is dark, blurred beyond the rest of the recording, or t
 from __future__ import annotations
 
 import hashlib
-import re
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -41,11 +40,6 @@ USUAL_OF, USUAL_FROM = 200, 5  # pictures
 _SMALL_PX = 400
 # Pictures closer than this share of the spacing asked for count as far enough apart: stamps jitter.
 NEARLY = 0.95
-
-# A marker in the compressed part of a JPEG: neither a stuffed byte, nor a restart, nor filling.
-_MARKER = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
-_WITHOUT_LENGTH = (0x01, 0xD8)
-_SCAN, _END = 0xDA, 0xD9
 
 
 @dataclass(frozen=True)
@@ -129,10 +123,10 @@ def look(picture: Picture, camera: Camera | None) -> Look:
 def decoded(data: bytes) -> Gray | None:
     """Grey levels (h, w) of the bytes of a picture, as the sensor read it; None where it is cut short or no picture.
 
-    OpenCV fills the lost part of a truncated file with grey, so that the end of the file is looked for first. How a
-    viewer should turn the picture (EXIF) is not followed: cameras are calibrated and mounted by their sensor's axes.
+    OpenCV refuses truncated data; reading the file itself, it would fill the lost part with grey. How a viewer should
+    turn the picture (EXIF) is not followed: cameras are calibrated and mounted by their sensor's axes.
     """
-    if not _is_whole(data):
+    if not data:
         return None
     import cv2
 
@@ -141,25 +135,6 @@ def decoded(data: bytes) -> Gray | None:
     except cv2.error:
         return None
     return None if found is None else np.asarray(found, dtype=np.uint8)
-
-
-def _is_whole(data: bytes) -> bool:
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" in data[-64:]
-    return _jpeg_ends(data) if data.startswith(b"\xff\xd8") else bool(data)
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Whether the markers of a JPEG lead to its end; what cameras append behind it is nobody's business."""
-    at = 2
-    while marker := _MARKER.search(data, at):
-        kind = marker[1][0]
-        if kind == _END:
-            return True
-        at = marker.end()
-        if kind not in _WITHOUT_LENGTH:
-            at += int.from_bytes(data[at : at + 2], "big")
-    return False
 
 
 def sharpness(gray: Gray) -> float:
