@@ -20,7 +20,7 @@ def threads(count: int = 0) -> Iterator[Executor]:
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(count or len(os.sched_getaffinity(0)))
+    pool = ThreadPoolExecutor(count or _processors())
     try:
         yield pool
     finally:
@@ -37,3 +37,8 @@ def ordered(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item
             yield under_way.popleft().result()
     while under_way:
         yield under_way.popleft().result()
+
+
+def _processors() -> int:
+    """Those that this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
