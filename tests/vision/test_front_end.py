@@ -208,7 +208,7 @@ def test_opencv_has_its_threads_back():
 
 @pytest.mark.parametrize(
     ("name", "pairs", "median", "skipped"),
-    [("kitti_odometry06", 50, 420, 0), ("lund_door", 11, 735, 0), ("euroc_v101", 5, 1080, 89)],
+    [("kitti_odometry06", 50, 395, 0), ("lund_door", 11, 699, 0), ("euroc_v101", 5, 1080, 89)],
 )
 def test_public_recordings(dataset, name, pairs, median, skipped):
     report = find(readers.read(dataset(name)), FrontEndConfig(spans=(1,), rate_hz=0.0)).report
