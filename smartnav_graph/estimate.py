@@ -25,7 +25,7 @@ from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_state import initialiser_of
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
-from smartnav_graph.pair_gate import lost
+from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.revise import extra_passes, position_builders, revise
 from smartnav_graph.session import Session
@@ -151,17 +151,24 @@ def solve_passes(
         cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
         warm = first if cold else estimate.values
         if learnt.stage > memory.stage and lost(problem.builders, estimate):
-            warm = _sequential(problem, windows, builders, learnt)
+            warm, learnt = _window_by_window(problem, windows, builders, learnt)
         memory = learnt
     raise AssertionError("unreachable")
 
 
-def _sequential(problem: Problem, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory) -> Any:
-    """Values to begin from where inertial data alone stray too far for what hangs on images: window by window, as a
-    replay has it, the trajectory never leaves what the images hold."""
-    smoother = incremental(ReplayConfig(), problem.session.t0_ns)
-    one_pass(smoother, windows, builders, replace(memory, phase="causal", settled={}), problem)
-    return smoother.values()
+def _window_by_window(
+    problem: Problem, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory
+) -> tuple[Any, Memory]:
+    """Values to begin from, and what they teach, where inertial data alone stray too far: as a replay has it, the
+    trajectory never leaves what standstills and images hold."""
+    smoother, t0_ns = incremental(ReplayConfig(), problem.session.t0_ns), problem.session.t0_ns
+    first, previous = replace(memory, phase="causal", stage=LAST_STAGE, settled={}), None
+    with _no_collection():
+        for window in windows:
+            smoother.update(build_step(window, previous, builders, first, t0_ns))
+            previous = smoother.known()
+    estimate = smoother.estimate()
+    return estimate.values, settled(builders, estimate, replace(memory, stage=LAST_STAGE, settled={}))
 
 
 def _forget(builders: Sequence[Builder]) -> None:
@@ -204,14 +211,17 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     problem = prepare(session, config or Config())
     clock.lap("prepare")
     initial = initialise(problem)
+    warm, memory = initial.warm, initial.memory
+    if not problem.session.absolute():
+        warm, memory = _window_by_window(problem, problem.windows, [initial.prior, *problem.builders], memory)
     _forget(problem.builders)
     clock.lap("initialise")
     estimate, memory, passes = solve_passes(
         problem,
         problem.windows,
         initial.prior,
-        initial.memory,
-        warm=initial.warm,
+        memory,
+        warm=warm,
         first_s=initial.stretch_s,
         progress=progress,
         clock=clock,

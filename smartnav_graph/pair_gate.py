@@ -94,8 +94,10 @@ def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tu
     pairs = builder.pairs
     x0, x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
     white = np.abs(sampson(there.R, there.t, x0, x1).residual) / builder.sigma
+    geometry = Geometry.of(pairs, there.R)
     use = (white < GATE * scale) & pairs.there
-    verdict = builder.judged(pairs, use, Geometry.of(pairs, there.R).parallax())
+    use &= geometry.plausible(there.t, np.full(len(pairs), builder.sigma * scale), use)
+    verdict = builder.judged(pairs, use, geometry.parallax())
     good = use & (verdict == IN_USE)[:, None]
     left = int(good.sum()) - POSE_DOF * int((verdict == IN_USE).sum())
     if left > POSE_DOF:

@@ -7,8 +7,8 @@
 The second is what is called a zero angular rate update: with the inertial factor beside it the gyro's mean reading is
 its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias would let wander.
 A standstill that is none must not bend the trajectory. Steady travel looks like rest: there a row that contradicts
-what else is known lets go (Geman, McClure: the force falls with the cube of the residual), and still pulls in what is
-merely unknown. A foot's stance is at worst a slower one: beyond `TAIL` sigmas the force is constant.
+what else is known lets go (Geman, McClure: the force falls with the cube of the residual). Where a replay knows how
+little it knows, after a minute of dead reckoning, a speed that is merely unknown contradicts nothing. A foot's stance is at worst a slower one: beyond `TAIL` sigmas the force is constant.
 
 Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, IEEE CG&A 25(6); Skog et al. (2010).
 """
@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 TAIL = 4.0
 # In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second; in metres a second.
 LETS_GO, LETS_GO_SPEED = 30.0, 0.3
+# A speed this many times its sigma contradicts a standstill.
+CONTRADICTS = 5.0
 # The pair of attitudes leaves the positions alone: m.
 ANYWHERE = 1e4
 # Prior sigma (m) of the floor's height.
@@ -76,7 +78,7 @@ class StandstillBuilder:
         speed = self.rests.speed_at(window.t1_ns)
         if np.isfinite(speed):
             if self.config.zupt:
-                self._add_speed(step, speed)
+                self._add_speed(step, speed, _unknown(previous))
             if self.config.flat_floor and self.rests.on_foot:
                 self._add_level(step)
         if self.config.zaru and previous is not None and window.kind != "gap":
@@ -84,10 +86,9 @@ class StandstillBuilder:
             if np.isfinite(turn):
                 self._add_turn(step, turn)
 
-    def _add_speed(self, step: Step, sigma: float) -> None:
-        zero = gtsam.PriorFactorVector(
-            key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma), max(LETS_GO_SPEED / sigma, TAIL))
-        )
+    def _add_speed(self, step: Step, sigma: float, unknown: float) -> None:
+        lets_go = max(LETS_GO_SPEED / sigma, CONTRADICTS * unknown / sigma, TAIL)
+        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma), lets_go))
         step.add(Tag(self.name, step.t_ns), zero)
 
     def _add_turn(self, step: Step, sigma: float) -> None:
@@ -108,6 +109,13 @@ class StandstillBuilder:
         keys = (key("X", step.index), key("V", step.index), step.use(self._floor))
         data = np.array([[self.config.floor_sigma]])
         step.blocks.append(Block("static_level", MODEL, [keys], data, step.t_ns, loss="huber"))
+
+
+def _unknown(previous: State | None) -> float:
+    """Sigma (m/s) of the speed at the keyframe before, where it is known; zero otherwise."""
+    if previous is None or previous.covariance is None:
+        return 0.0
+    return float(np.sqrt(np.trace(previous.covariance[6:9, 6:9])))
 
 
 def build(context: FactorContext) -> StandstillBuilder | None:

@@ -4,6 +4,9 @@ With R known, each match gives the normal n = R x1~ x x0~ of its epipolar plane,
 all of them: two matches give a hypothesis, and the one that most matches agree with is taken (MSAC). It is compared
 with the turn that was told, not with a fit of its own: a pair in which all points jump alike fits its own wrong motion.
 
+A wrong match that happens to lie on its epipolar line does most harm where it seems to be near: its weight grows with
+the square of its parallax. So a point must lie in front of both cameras, and not much nearer than the others.
+
 Source: Torr, Zisserman (2000), MLESAC, CVIU 78(1); Kneip, Chli, Siegwart (2011), Robust real-time visual odometry with
 a single camera and an IMU, BMVC.
 """
@@ -23,12 +26,14 @@ Mask = NDArray[np.bool_]
 
 # Residual in sigmas up to which a match agrees, and hypotheses tried: with 30 % outliers half of them are sound.
 AGREES = 3.0
+# A point nearer than so many times this quantile of the inliers' inverse distances is not believed.
+MUCH_NEARER, NEAR_SHARE = 3.0, 0.75
 TRIED = 40
 
 
 @dataclass(frozen=True)
 class Gated:
-    """inliers (n, k) of the padded matches; direction (n, 3) of c0_t_c1, of either sign; parallax (n,) rad, median
+    """inliers (n, k) of the padded matches; direction (n, 3) of c0_t_c1; parallax (n,) rad, median
     after the turn is taken out"""
 
     inliers: Mask
@@ -55,7 +60,9 @@ def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
     for _ in range(2):
         weight = (geometry.square(best) < limit) & pairs.there
         best, cost = _better(geometry, geometry.fitted(weight / geometry.scale(best)), limit, best, cost)
-    return Gated((geometry.square(best) < limit) & pairs.there, best, geometry.parallax())
+    inliers = (geometry.square(best) < limit) & pairs.there
+    best = best * np.where(_median(geometry.nearness(best)[0], inliers) < 0.0, -1.0, 1.0)[:, None]
+    return Gated(inliers & geometry.plausible(best, sigma, inliers), best, geometry.parallax())
 
 
 def _better(geometry: Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
@@ -99,8 +106,33 @@ class Geometry:
         moment = (self.normals * weight[..., None]).transpose(0, 2, 1) @ self.normals
         return np.asarray(np.linalg.eigh(moment)[1][:, :, 0])
 
+    def nearness(self, t: Floats) -> tuple[Floats, Floats]:
+        """Inverse distance (n, k) along the rays of the first image, in units of the baselines t (n, 3), and its sigma
+        for one of the points."""
+        across = cross(t[:, None], self.y)
+        square = np.maximum((across**2).sum(axis=-1), 1e-18)
+        return -(self.normals * across).sum(axis=-1) / square, np.linalg.norm(self.y, axis=-1) / np.sqrt(square)
+
+    def plausible(self, t: Floats, sigma: Floats, inliers: Mask) -> Mask:
+        """Mask (n, k) of points in front of both cameras, and not much nearer than most of the inliers.
+
+        t : (n, 3) baselines with their sign; sigma : (n,) of a match
+        """
+        near, spread = self.nearness(t)
+        doubt = AGREES * sigma[:, None] * spread
+        ahead = near > -doubt
+        usual = _median(near, inliers & ahead, NEAR_SHARE)[:, None]
+        return np.asarray(ahead & (near < MUCH_NEARER * np.maximum(usual, 0.0) + doubt))
+
     def parallax(self) -> Floats:
         """Median angle (n,) between the rays of a match."""
         apart = np.linalg.norm(self.normals, axis=-1)
         angle = apart / np.maximum(np.linalg.norm(self.a, axis=-1) * np.linalg.norm(self.y, axis=-1), 1e-12)
-        return np.asarray(np.nan_to_num(np.nanmedian(np.where(self.there, angle, np.nan), axis=1)))
+        return _median(angle, self.there)
+
+
+def _median(values: Floats, mask: Mask, share: float = 0.5) -> Floats:
+    """Quantile (n,) of the values (n, k) under a mask; zero where there are none."""
+    rank = (share * np.maximum(mask.sum(axis=1) - 1, 0)).astype(np.intp)
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)[np.arange(len(values)), rank]
+    return np.where(np.isfinite(ordered), ordered, 0.0)
