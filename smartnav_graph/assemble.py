@@ -142,7 +142,7 @@ def _weights(builder: PositionBuilder, white: Floats) -> Floats:
     """Robust weights (n,) of the loss in force."""
     if builder.config.loss != "huber":
         return np.ones(len(white))
-    return loss_weights((white**2).sum(axis=1), "huber")[0]
+    return loss_weights((white**2).sum(axis=1), "huber", dim=white.shape[1])[0]
 
 
 def _flat(parts: Sequence[Part]) -> Residuals:

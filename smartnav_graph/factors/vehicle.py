@@ -35,9 +35,11 @@ from smartnav_graph.timebase import NS, Gap
 Floats = NDArray[np.float64]
 
 MOUNT_SIZE = STATES["M"].dim
-# Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken.
+# Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken: a mean,
+# and what a straight line says of the end. A force that lagged would be in step with the slide that it is part of, and
+# pass for its cause.
 RATE_S = 0.05
-FORCE_S = 0.3
+FORCE_S = 0.6
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,14 @@ def recent(window: Window, values: Floats, seconds: float) -> Floats:
     return np.asarray(weight @ values / weight.sum())
 
 
+def latest(window: Window, values: Floats, seconds: float) -> Floats:
+    """Value (3,) at the window's end of inertial intervals (m, 3), by the means over the last `seconds` and over half of them,
+    or of all of it where it is shorter."""
+    span = min(seconds, float(window.dt.sum()))
+    whole, half = recent(window, values, span), recent(window, values, 0.5 * span)
+    return np.asarray(half + (half - whole))
+
+
 def due(window: Window, period_s: float) -> bool:
     """Whether a border of the clock's periods lies in the window: at most one row a period, the same in every pass."""
     period = round(period_s * NS)
@@ -205,7 +215,7 @@ class VehicleBuilder:
         if not len(window.dt) or not due(window, self.config.period_s) or self._silent(step):
             return
         rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
-        force = recent(window, window.accel, FORCE_S) - step.bias.accelerometer()
+        force = latest(window, window.accel, FORCE_S) - step.bias.accelerometer()
         sigma = [known * memory.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
         keys = [key("X", step.index), key("V", step.index), step.use(mount_state(self.config))]

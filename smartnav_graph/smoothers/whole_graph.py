@@ -64,7 +64,7 @@ class Stack:
 
     def weight(self, residual: Floats) -> Floats:
         """Weight (m,) of the loss on whitened residuals (m, d)."""
-        return loss_weights((residual**2).sum(axis=1), self.loss, self.reach)[0]
+        return loss_weights((residual**2).sum(axis=1), self.loss, self.reach, residual.shape[1])[0]
 
     def linearize(self, values: Any) -> tuple[Floats, list[Floats]]:
         """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss.
@@ -98,7 +98,8 @@ class Stack:
     def cost(self, values: Any) -> float:
         """Half the sum of squares of the used rows, under the loss."""
         residual = self.linearize(values)[0][self.used]
-        return float(loss_weights((residual**2).sum(axis=1), self.loss, self.reach[self.used])[1].sum())
+        square, dim = (residual**2).sum(axis=1), residual.shape[1]
+        return float(loss_weights(square, self.loss, self.reach[self.used], dim)[1].sum())
 
     def add_to(self, linear: Any, values: Any) -> None:
         """Append one linear factor a used row; held states and states that nothing depends on have no column."""

@@ -104,11 +104,11 @@ AXES = body_R_vehicle("+y", "+z")
 
 
 def window(t0_s: float, t1_s: float) -> Window:
-    """Inertial intervals of 10 ms: turning ever faster to the left, pushed ahead at 2 m/s^2 in the last 0.3 s."""
+    """Inertial intervals of 10 ms: turning ever faster to the left, pushed ahead ever harder, 2 m/s^2 at the end."""
     n = round((t1_s - t0_s) * 100)
     gyro, accel = np.zeros((n, 3)), np.tile([0.0, 0.0, 9.8], (n, 1))
     gyro[:, 2] = np.arange(n) / 100
-    accel[-30:, 1] = 2.0
+    accel[:, 1] = 2.0 * (np.arange(n) + 0.5) / n
     return Window(3, round(t0_s * NS), round(t1_s * NS), "normal", np.full(n, 0.01), accel, gyro)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smartnav_graph.graph import Block, SessionState, Step, key
-from smartnav_graph.losses import loss_weights
+from smartnav_graph.losses import huber_limit, loss_weights
 from smartnav_graph.smoothers.whole_graph import (
     Snapshot,
     Stack,
@@ -145,8 +145,16 @@ def test_the_loss_is_on_the_norm_of_a_row():
     at, made = values(rng, 1), block(np.random.default_rng(1), 1, loss="huber")
     (stack,) = stacks_of([made], {})
     residual = stack.linearize(at)[0][0]
-    expected = 1.345 * np.linalg.norm(residual) - 0.5 * 1.345**2
-    assert np.linalg.norm(residual) > 1.345 and stack.cost(at) == pytest.approx(expected)
+    limit = huber_limit(3)
+    expected = limit * np.linalg.norm(residual) - 0.5 * limit**2
+    assert np.linalg.norm(residual) > limit and stack.cost(at) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_as_many_good_rows_lie_outside_however_many_components_they_have(dim):
+    norm = np.linalg.norm(np.random.default_rng(0).standard_normal((200_000, dim)), axis=1)
+    assert (norm > huber_limit(dim)).mean() == pytest.approx(0.1786, abs=0.004)
+    assert loss_weights(norm**2, "huber", dim=dim)[0].mean() > 0.94
 
 
 def test_rows_not_used_have_residuals_and_nothing_else():
