@@ -175,8 +175,8 @@ def recent(window: Window, values: Floats, seconds: float) -> Floats:
 
 
 def latest(window: Window, values: Floats, seconds: float) -> Floats:
-    """Value (3,) at the window's end of inertial intervals (m, 3), by the means over the last `seconds` and over half of them,
-    or of all of it where it is shorter."""
+    """Value (3,) at the window's end of inertial intervals (m, 3): a straight line through their means over the last
+    `seconds`, or all of the window where it is shorter, and over half of that."""
     span = min(seconds, float(window.dt.sum()))
     whole, half = recent(window, values, span), recent(window, values, 0.5 * span)
     return np.asarray(half + (half - whole))
