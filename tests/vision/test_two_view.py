@@ -141,6 +141,15 @@ def test_the_two_poses_of_a_plane_are_told_where_nothing_tells_them_apart():
     assert "another pose explains the plane as well" in found.reason
 
 
+def test_what_lies_off_a_plane_tells_its_two_poses_apart():
+    for seed in range(8):
+        on, off = view(seed, 270, plane=True), view(seed + 100, 30)
+        xy0, xy1 = (np.concatenate(both) for both in ((on.xy0, off.xy0), (on.xy1, off.xy1)))
+        found = two_view(xy0, xy1, SIGMA)
+        assert found.kind in ("planar", "general") and found.reason == ""
+        assert turn_deg(found.c0_R_c1, on.R) < 0.6 and angle_deg(found.c0_t_c1, on.t) < 6.0
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_the_methods_agree(method):
     pair = view(3, wrong=0.4)
