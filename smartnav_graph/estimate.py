@@ -162,13 +162,14 @@ def _window_by_window(
     """Values to begin from, and what they teach, where inertial data alone stray too far: as a replay has it, the
     trajectory never leaves what standstills and images hold."""
     smoother, t0_ns = incremental(ReplayConfig(), problem.session.t0_ns), problem.session.t0_ns
-    first, previous = replace(memory, phase="causal", stage=LAST_STAGE, settled={}), None
+    first, previous = replace(memory, phase="causal", settled={}), None
     with _no_collection():
         for window in windows:
             smoother.update(build_step(window, previous, builders, first, t0_ns))
             previous = smoother.known()
     estimate = smoother.estimate()
-    return estimate.values, settled(builders, estimate, replace(memory, stage=LAST_STAGE, settled={}))
+    judged = replace(memory, settled={})
+    return estimate.values, judged if memory.stage < LAST_STAGE else settled(builders, estimate, judged)
 
 
 def _forget(builders: Sequence[Builder]) -> None:

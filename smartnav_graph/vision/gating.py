@@ -29,6 +29,8 @@ AGREES = 3.0
 # A point nearer than so many times this quantile of the inliers' inverse distances is not believed.
 MUCH_NEARER, NEAR_SHARE = 3.0, 0.75
 TRIED = 40
+# Matches times hypotheses looked at in one go: what stays in the cache.
+AT_ONCE = 20_000
 
 
 @dataclass(frozen=True)
@@ -54,24 +56,26 @@ def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
     rng = np.random.default_rng(seed)
     best, cost = np.tile([0.0, 0.0, 1.0], (len(R), 1)), np.full(len(R), np.inf)
     count = np.maximum(pairs.count, 1)
-    for _ in range(TRIED):
-        one, other = (geometry.normals_at((rng.random(len(R)) * count).astype(np.intp)) for _ in range(2))
-        best, cost = _better(geometry, np.cross(one, other), limit, best, cost)
+    at_once = int(np.clip(AT_ONCE // max(pairs.there.size, 1), 1, TRIED))
+    for _ in range(-(-TRIED // at_once)):
+        drawn = (rng.random((2, at_once, len(R))) * count).astype(np.intp)
+        best, cost = _better(geometry, cross(*(geometry.normals_at(place) for place in drawn)), limit, best, cost)
     for _ in range(2):
         weight = (geometry.square(best) < limit) & pairs.there
-        best, cost = _better(geometry, geometry.fitted(weight / geometry.scale(best)), limit, best, cost)
+        best, cost = _better(geometry, geometry.fitted(weight / geometry.scale(best))[None], limit, best, cost)
     inliers = (geometry.square(best) < limit) & pairs.there
     best = best * np.where(_median(geometry.nearness(best)[0], inliers) < 0.0, -1.0, 1.0)[:, None]
     return Gated(inliers & geometry.plausible(best, sigma, inliers), best, geometry.parallax())
 
 
 def _better(geometry: Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
-    """The better of two baselines (n, 3) of each pair, and its cost (n,)."""
-    size = np.linalg.norm(tried, axis=1, keepdims=True)
+    """The best of some baselines (h, n, 3) of each pair and the one before (n, 3), and its cost (n,)."""
+    size = np.linalg.norm(tried, axis=-1, keepdims=True)
     tried = np.where(size > 1e-12, tried / np.maximum(size, 1e-12), best)
-    new = np.where(geometry.there, np.minimum(geometry.square(tried), limit), 0.0).sum(axis=1)
-    take = new < cost
-    return np.where(take[:, None], tried, best), np.where(take, new, cost)
+    new = np.where(geometry.there, np.minimum(geometry.square(tried), limit), 0.0).sum(axis=-1)
+    first, row = new.argmin(axis=0), np.arange(len(best))
+    take = new[first, row] < cost
+    return np.where(take[:, None], tried[first, row], best), np.where(take, new[first, row], cost)
 
 
 class Geometry:
@@ -87,18 +91,18 @@ class Geometry:
         return cls(a, b @ R.transpose(0, 2, 1), R, pairs.there)
 
     def normals_at(self, place: NDArray[np.intp]) -> Floats:
-        """Normal (n, 3) of one match a pair."""
-        return np.asarray(self.normals[np.arange(len(place)), place])
+        """Normals (..., n, 3) of one match (..., n) a pair."""
+        return np.asarray(self.normals[np.arange(place.shape[-1]), place])
 
     def scale(self, t: Floats) -> Floats:
-        """s^2 (n, k) of `epipolar.sampson`."""
-        l0 = cross(t[:, None], self.y)
-        l1 = cross(self.a, t[:, None]) @ self.R
+        """s^2 (..., n, k) of `epipolar.sampson`, of baselines t (..., n, 3)."""
+        l0 = cross(t[..., None, :], self.y)
+        l1 = cross(self.a, t[..., None, :]) @ self.R
         return np.asarray((l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + 1e-18)
 
     def square(self, t: Floats) -> Floats:
-        """Squared Sampson residuals (n, k) of baselines t (n, 3)."""
-        e = (self.normals @ t[:, :, None])[..., 0]
+        """Squared Sampson residuals (..., n, k) of baselines t (..., n, 3)."""
+        e = (self.normals @ t[..., None])[..., 0]
         return np.asarray(e**2 / self.scale(t))
 
     def fitted(self, weight: Floats) -> Floats:
