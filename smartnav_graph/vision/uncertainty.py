@@ -6,6 +6,8 @@ general pose is the mean over the poses around the fit that are as probable as t
 
     C = 1/2n sum_k  information(x (+) +- sqrt(n) L_k)^-1,    L L^T = information(x)^-1,  n = 5
 
+It is honest where the direction is known to about 0.2 rad; beyond, no Gaussian on a tangent plane tells the truth.
+
 Source: Julier, Uhlmann (1997), A new extension of the Kalman filter to nonlinear systems (the symmetric points).
 """
 

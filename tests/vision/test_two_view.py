@@ -9,7 +9,16 @@ from scipy.spatial.transform import Rotation
 from view_pairs import FORWARD, NOWHERE, SHORT, SIDEWAYS, SIGMA, turned, view
 
 from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.vision.refine import Epipolar, Matched, Plane, RotationPrior, Turn, minimise, tangent_basis
+from smartnav_graph.vision.refine import (
+    Epipolar,
+    Matched,
+    Plane,
+    RotationPrior,
+    Turn,
+    minimise,
+    rotation_vector,
+    tangent_basis,
+)
 from smartnav_graph.vision.two_view import METHODS, two_view
 from smartnav_graph.vision.uncertainty import covariance
 
@@ -249,6 +258,12 @@ def test_wrong_input_is_named():
         RotationPrior(2.0 * np.eye(3), GYRO)
     with pytest.raises(ConfigError, match="sigma = 0"):
         RotationPrior(np.eye(3), 0.0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-13, 1e-6, 0.5, 3.0, 3.1, np.pi - 1e-7])
+def test_the_vector_of_a_rotation(size):
+    w = size * np.array([2.0, -1.0, 2.0]) / 3.0
+    np.testing.assert_allclose(rotation_vector(Rotation.from_rotvec(w).as_matrix()), w, atol=1e-9, rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["rotation", "planar", "general"])
