@@ -52,9 +52,9 @@ def initialiser_of(problem: Problem, longest_s: float | None = None) -> Initiali
 
 
 def _standing(problem: Problem, shortest_s: float) -> int | None:
-    """End of the standstill that the first keyframe lies in, if it lasts long enough."""
+    """End of the standstill told of that the first keyframe lies in, if it lasts long enough."""
     start = problem.windows[0].t1_ns
-    spans = [] if problem.rests is None else problem.rests.spans()
+    spans = () if problem.rests is None else problem.rests.told
     ends = [b for a, b in spans if a <= start < b and b - start >= shortest_s * NS]
     return ends[0] if ends else None
 

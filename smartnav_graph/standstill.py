@@ -109,13 +109,15 @@ class Standstills:
     """Standstills of a recording, at its inertial samples.
 
     t_ns (n,); speed_sigma (n,) m/s of the zero velocity, NaN in motion; turn_sigma (n,) rad of the turn between two
-    keyframes, NaN where not truly at rest; on_foot : the device is mounted on a foot
+    keyframes, NaN where not truly at rest; on_foot : the device is mounted on a foot; told : first and last stamp of
+    the standstills that are listed or that a camera saw
     """
 
     t_ns: Times
     speed_sigma: Floats
     turn_sigma: Floats
     on_foot: bool = False
+    told: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def none(cls, t_ns: Times) -> Standstills:
@@ -196,14 +198,16 @@ def find_standstills(
             speed = stance_speed(imu, gravity, config.detector)
             speed = np.where(np.isnan(speed), found.speed_sigma, speed)
             found = Standstills(imu.t_ns, speed, found.turn_sigma, True)
+    told: list[tuple[int, int]] = []
     for periods, wanted in ((listed, config.listed), (seen, config.detect)):
         if wanted and periods is not None:
             found = _with_listed(found, periods)
+            told += zip(periods.t_ns.tolist(), periods.t_end_ns.tolist(), strict=True)
     speed, turn = found.speed_sigma.copy(), found.turn_sigma.copy()
     for gap in gaps:
         inside = slice(*np.searchsorted(imu.t_ns, [gap.start_ns, gap.end_ns + 1]))
         speed[inside] = turn[inside] = np.nan
-    return Standstills(imu.t_ns, speed, turn, found.on_foot)
+    return Standstills(imu.t_ns, speed, turn, found.on_foot, tuple(told))
 
 
 def _with_listed(found: Standstills, listed: StaticPeriod) -> Standstills:
