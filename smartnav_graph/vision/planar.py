@@ -31,7 +31,7 @@ from smartnav_graph.vision.refine import (
 Floats = NDArray[np.float64]
 
 LEAST_PLANAR = 6  # matches: eight unknowns and four to judge them by
-LEAST_SHARE_OF_PLANE = 0.6  # of the coplanar matches: with fewer on it no plane explains more than depth does
+LEAST_SHARE_OF_PLANE = 0.8  # of the coplanar matches: with fewer on it no plane explains more than depth does (GRIC)
 TURNED = 1e-3  # rad by which two poses differ
 CLEARLY_BETTER = 9.0  # difference of squared misses, 3 sigmas
 
