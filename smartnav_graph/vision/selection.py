@@ -78,6 +78,8 @@ def choose(models: Mapping[str, Explained]) -> str:
     told from depth by the noise that the matches show.
     """
     rows = np.any([told.square < GATE_SQUARE[RESIDUALS[kind]] for kind, told in models.items()], axis=0)
+    if not rows.any():
+        return "general"  # of which too few matches agree
     variance = noise(models["general"].square)
     moved = min(models.keys() & MOVED, key=lambda kind: gric(kind, models[kind], rows, variance))
     kinds = [moved, *sorted(models.keys() - MOVED)]
@@ -102,4 +104,4 @@ def by_chance(matched: Matched, agree: int, kind: str, sample: int) -> float:
 
 def hardly_moves(square: Floats) -> bool:
     """Is nearly every point where it was, as far as it can tell by itself? square (m,) : see `stands_still`."""
-    return bool(np.mean(square < GATE_SQUARE[2]) >= STILL_SHARE)
+    return bool((square < GATE_SQUARE[2]).sum() >= STILL_SHARE * max(len(square), 1))

@@ -4,7 +4,7 @@ The information J^T J of a fit holds where it is evaluated, and that place is it
 with little parallax, a fit that happens to err claims to know more than one that does not. So the covariance of a
 general pose is the mean over the poses around the fit that are as probable as the fit's own covariance says,
 
-    C = 1/2n sum_k  information(x (+) +- sqrt(n) L_k)^-1,    L L^T = information(x)^-1,  n = 5
+    C = 1/2n sum_k  information(x (+) +- sqrt(n) l_k)^-1,    sum_k l_k l_k^T = information(x)^-1,  n = 5
 
 It is honest where the direction is known to about 0.2 rad; beyond, no Gaussian on a tangent plane tells the truth.
 
@@ -23,7 +23,7 @@ from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, shifted, t
 Floats = NDArray[np.float64]
 
 UNKNOWNS = 5
-LARGEST_CONDITION = 1e12  # of the scaled information: more is a direction the matches leave open
+LARGEST_CONDITION = 1e10  # of the scaled information: more is a direction the matches leave open
 
 
 def covariance(kind: str, matched: Matched, fit: Fit, prior: RotationPrior | None) -> Floats | None:
@@ -46,16 +46,17 @@ def inverse(information: Floats) -> Floats | None:
     if not (scale > 0).all():
         return None
     outer = scale[..., :, None] * scale[..., None, :]
-    scaled = information / outer
-    if not (np.linalg.cond(scaled) < LARGEST_CONDITION).all():
+    values, vectors = np.linalg.eigh(information / outer)
+    if not (values[..., 0] * LARGEST_CONDITION > values[..., -1]).all():
         return None
-    return np.asarray(np.linalg.inv(scaled) / outer)
+    return np.asarray((vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer)
 
 
 def _around(found: Floats, matched: Matched, fit: Fit, prior: RotationPrior | None) -> Floats | None:
     """Mean covariance over the symmetric points of the covariance `found`."""
     R, t = fit.state
-    points = np.sqrt(UNKNOWNS) * np.linalg.cholesky(found).T
+    spread, axes = np.linalg.eigh(found)
+    points = (np.sqrt(UNKNOWNS * np.maximum(spread, 0.0)) * axes).T
     steps = np.concatenate([points, -points])
     turns = R @ Rotation.from_rotvec(steps[:, :3]).as_matrix()
     ways = np.stack([shifted(t, step[3:]) for step in steps])

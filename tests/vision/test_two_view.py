@@ -220,9 +220,9 @@ def test_few_matches():
 def test_agreement_by_chance_is_not_believed():
     rng = np.random.default_rng(0)
     for matches in (8, 12, 60):
-        for seed in range(8):
+        for seed, sigma in enumerate([SIGMA] * 7 + [1e-12]):
             xy0, xy1 = rng.uniform(-0.45, 0.45, (2, matches, 2))
-            found = two_view(xy0, xy1, SIGMA, seed=seed)
+            found = two_view(xy0, xy1, sigma, seed=seed)
             assert found.kind == "failed"
             assert "matches agree" in found.reason
 
@@ -283,3 +283,25 @@ def test_derivatives_are_those_of_differences(kind):
         # the whitening of point transfer is held: a relative error of the size of the noise times its change
         atol = 1e-4 * np.abs(J[..., k]).max() if kind == "general" else 0.08 * np.abs(J[..., k]).max()
         np.testing.assert_allclose((ahead - behind) / (2 * step), J[..., k], atol=atol)
+
+
+def test_degenerate_matches_are_answered_in_words():
+    rng = np.random.default_rng(0)
+    shapes = {
+        "one point": lambda a: np.tile(a[:1], (len(a), 1)),
+        "on a line": lambda a: np.column_stack([rng.uniform(-1, 1, len(a)), a[:, 1]]),
+        "half a turn": lambda a: -a,
+        "zoomed": lambda a: 1.2 * a,
+        "shifted": lambda a: a + np.array([0.1, 0.0]),
+        "anywhere": lambda a: rng.uniform(-1, 1, a.shape),
+    }
+    for k in range(90):
+        name = list(shapes)[k % len(shapes)]
+        xy0 = rng.uniform(-1, 1, (int(rng.integers(6, 40)), 2))
+        xy0[:, 1] = 0.1 if name == "on a line" else xy0[:, 1]
+        prior = RotationPrior(np.eye(3), 0.01) if k % 2 else None
+        found = two_view(xy0, shapes[name](xy0), 10.0 ** rng.uniform(-6, -1), prior=prior, seed=k)
+        assert np.isfinite(found.c0_R_c1).all() and np.isfinite(found.c0_t_c1).all()
+        assert not np.isnan(found.covariance).any()
+        assert found.kind == "failed" if name in ("on a line", "anywhere") else True
+        assert bool(found.reason) or found.kind != "failed"
