@@ -33,10 +33,8 @@ Mask = NDArray[np.bool_]
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
 # Share of its matches that a pair must keep.
 LEAST_SHARE = 0.5
-# How far matches are settled (`Memory.settled`): by the turn, at states found with images, once more and compressed.
-BY_TURN, BY_STATES, COMPRESSED = 1, 2, 3
-# Reach of the loss, in sigmas, while the trajectory is that of inertial data, whose way is far from that of the images.
-FIRST_REACH = 2.0
+# Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, once more and compressed.
+COMPRESSED = 3
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
 # Sigma of a match in normalised coordinates where no camera is calibrated: 0.7 px of a phone's 640 x 480.
@@ -192,8 +190,6 @@ class CoplanarityBuilder:
         if memory.phase == "causal":
             return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), self.config.reach)
         use, settled = self._padded_use(memory), memory.settled.get(self.name, 0)
-        if settled == BY_TURN:
-            return PairRows(self.pairs, self.rig, sigma, use, FIRST_REACH)
         if settled == COMPRESSED and self.frozen is not None and self.config.compress:
             return CompressedRows(self.pairs, self.rig, sigma, use, self.config.reach, self.frozen)
         return PairRows(self.pairs, self.rig, sigma, use, self.config.reach)
