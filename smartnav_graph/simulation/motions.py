@@ -119,12 +119,15 @@ class Corridors:
     rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the speeds left an axis, root mean square.
     """
 
-    turns: tuple[str, ...] = ("LRL", "RRL", "LLL", "RRL", "LLL", "RRR", "RLL", "LLR", "LRR", "LRR")
+    turns: tuple[str, ...] = (
+        *("LLRR", "RLLL", "RRRL", "LLLR", "RLLL"),
+        *("LRRR", "LRRR", "LRRR", "LLRL", "LLRR"),
+    )
     rest_s: float = 180.0
     stop_s: float = 10.0
-    drive_s: float = 18.8
+    drive_s: float = 14.0
     ramp_s: float = 2.0
-    turn_s: float = 4.0
+    turn_s: float = 3.9
     halt_s: float = 0.8
     speed_m_s: float = 1.0
     fidget_m_s: float = 4e-4

@@ -84,8 +84,9 @@ _TROLLEY = motions.Corridors()
 _CORRIDORS = CameraModel(
     camera=PHONE_CAMERA,
     mount=_ON_PHONE,
-    scene=CorridorGrid(nodes=(4, 6), origin=(3, 0), spacing_m=_TROLLEY.spacing_m, per_m2=20.0),
+    scene=CorridorGrid(nodes=(4, 5), origin=(3, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
     rate_hz=1.25,
+    range_m=(0.3, 40.0),
     count=(15, 60),
     pairs=(1,),
     faults=Faults(outliers=(0.1, 0.3)),

@@ -22,6 +22,8 @@ Rows = NDArray[np.intp]
 _BEFORE = 1.0 - 1e-6
 # Metres before a face at which there must be room to see it from.
 _CLEAR_M = 1e-6
+# Every point is seen from `_NEAR_M`; from twice as far, half of them.
+_NEAR_M, _FAR_M = 4.0, 100.0
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,15 @@ class Box:
 
 @dataclass(frozen=True)
 class Scene:
-    """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,)."""
+    """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,), which stand out to a
+    distance of `reach` (n,) m: fine ones are seen from near only."""
 
     corner: Floats
     u: Floats
     v: Floats
     points: Floats
     face: Rows
+    reach: Floats
 
     @cached_property
     def normal(self) -> Floats:
@@ -54,10 +58,10 @@ class Scene:
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
     def near(self, centre: Floats, range_m: float) -> Rows:
-        """Points within `range_m` of a place (3,), in their order."""
+        """Points within `range_m`, and within their reach, of a place (3,), in their order."""
         rows = np.flatnonzero(np.abs(self._east - centre[0]) < range_m)
         away = self.points[rows] - centre
-        return np.asarray(rows[np.einsum("ni,ni->n", away, away) < range_m**2])
+        return np.asarray(rows[np.einsum("ni,ni->n", away, away) < np.minimum(self.reach[rows], range_m) ** 2])
 
     @cached_property
     def _east(self) -> Floats:
@@ -66,23 +70,24 @@ class Scene:
     def seen_from(self, centre: Floats, rows: Rows) -> Rows:
         """Those of the points `rows` that no face hides from a camera at `centre` (3,), and that face it."""
         ahead = np.einsum("ni,ni->n", centre - self.points[rows], self.normal[self.face[rows]]) > 0.0
-        rows = rows[ahead]
-        return rows[~self._hidden(centre, rows)]
+        return self._unhidden(centre, rows[ahead])
 
-    def _hidden(self, centre: Floats, rows: Rows) -> NDArray[np.bool_]:
-        """Mask of the points with another face on the way to them; what is closed hides by a face seen from here."""
-        hidden, way = np.zeros(len(rows), dtype=bool), self.points[rows] - centre
+    def _unhidden(self, centre: Floats, rows: Rows) -> Rows:
+        """Those without another face on the way to them; what is closed hides by a face seen from here."""
         height = np.einsum("fi,fi->f", centre - self.corner, self.normal)
-        size = np.linalg.norm(self.u + self.v, axis=1) / 2
-        away = np.linalg.norm(self.corner + (self.u + self.v) / 2 - centre, axis=1) - size
-        farthest = np.sqrt((way**2).sum(axis=1).max(initial=0.0))
-        for f in np.flatnonzero((height > 0.0) & (away < farthest)):
+        middle, size = self.corner + (self.u + self.v) / 2, np.linalg.norm(self.u + self.v, axis=1) / 2
+        away = np.linalg.norm(middle - centre, axis=1) - size
+        way = self.points[rows] - centre
+        for f in np.argsort(away, kind="stable"):
+            if height[f] <= 0.0:
+                continue
             down = -way @ self.normal[f]
             share = height[f] / np.where(down > 0.0, down, np.inf)
             at = share[:, None] * way + (centre - self.corner[f])
             a, b = (at @ (edge / (edge @ edge)) for edge in (self.u[f], self.v[f]))
-            hidden |= (share < _BEFORE) & (down > 0.0) & (a >= 0.0) & (a <= 1.0) & (b >= 0.0) & (b <= 1.0)
-        return hidden
+            hidden = (share < _BEFORE) & (down > 0.0) & (a >= 0.0) & (a <= 1.0) & (b >= 0.0) & (b <= 1.0)
+            rows, way = rows[~hidden], way[~hidden]
+        return rows
 
 
 def build(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
@@ -92,9 +97,10 @@ def build(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scen
     area = np.linalg.norm(np.cross(u, v), axis=1)
     face = np.repeat(np.arange(len(area)), rng.poisson(per_m2 * area))
     a, b = rng.random((2, len(face), 1))
-    scene = Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face)
+    reach = _NEAR_M / np.maximum(rng.random(len(face)), _NEAR_M / _FAR_M)
+    scene = Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face, reach)
     free = _free(scene.points + _CLEAR_M * scene.normal[face], boxes)
-    return Scene(corner, u, v, scene.points[free], face[free])
+    return Scene(corner, u, v, scene.points[free], face[free], reach[free])
 
 
 def _free(points: Floats, boxes: Sequence[Box]) -> NDArray[np.bool_]:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 import smartnav_graph as sn
 from smartnav_graph.calibration.camera import Camera
@@ -56,7 +55,9 @@ def test_the_camera_sees_what_projection_by_hand_says():
     truth = trajectory.sample([7.0])
     nav_R_body, p = truth.nav_R_body[0], truth.nav_t_body[0]
     body_point = np.array([1.0, 2.0, 0.5]) + model.mount.body_t
-    alone = replace(scene, points=(p + nav_R_body @ body_point)[None], face=np.zeros(1, dtype=int))
+    alone = replace(
+        scene, points=(p + nav_R_body @ body_point)[None], face=np.zeros(1, dtype=int), reach=np.array([9.0])
+    )
     alone = replace(
         alone, corner=p[None] + nav_R_body @ [0, 9.0, 0], u=nav_R_body[None, :, 0], v=nav_R_body[None, :, 2]
     )
@@ -69,9 +70,9 @@ def test_the_camera_sees_what_projection_by_hand_says():
 def test_inliers_miss_the_epipolar_geometry_by_the_noise():
     session = recorded()
     r, baseline = misses(session)
-    moved = r[baseline > 0.02]
-    low, high = chi2(len(moved)).ppf([1e-3, 1 - 1e-3])
-    assert low < (moved**2).sum() < high
+    moved = r[baseline > 0.04]
+    # distortion stretches the pixel by a few percent from place to place, and the noise of one pixel with it
+    assert (moved**2).mean() == pytest.approx(1.0, abs=0.1)
     assert len(moved) > 2000 and session.matches.extra["truth_inlier"].all()
     spans = np.unique(session.matches.image_id_1 - session.matches.image_id_0)
     np.testing.assert_array_equal(spans, [1, 2])
@@ -82,8 +83,8 @@ def test_outliers_are_marked_and_as_many_as_told():
     bad = session.matches.extra["truth_inlier"] == 0
     assert bad.mean() == pytest.approx(0.2, abs=0.01)
     r, baseline = misses(session)
-    assert np.median(np.abs(r[bad & (baseline > 0.02)])) > 20.0
-    assert np.abs(r[~bad & (baseline > 0.02)]).max() < 5.0
+    assert np.median(np.abs(r[bad & (baseline > 0.04)])) > 20.0
+    assert np.abs(r[~bad & (baseline > 0.04)]).max() < 5.0
 
 
 def test_a_glitch_moves_one_frame_and_spoils_its_matches():
@@ -125,9 +126,8 @@ def test_a_wrong_boresight_and_clock_are_in_the_images_and_not_in_the_session():
     assert session.sensors == straight.sensors and session.calibration == straight.calibration
     np.testing.assert_array_equal(session.images.t_ns, straight.images.t_ns)
     r, baseline = misses(session, wrong)
-    moved = baseline > 0.02
-    low, high = chi2(moved.sum()).ppf([1e-3, 1 - 1e-3])
-    assert low < (r[moved] ** 2).sum() < high
+    moved = baseline > 0.04
+    assert (r[moved] ** 2).mean() == pytest.approx(1.0, abs=0.1)
     told, _ = misses(session, EXACT)
     assert (told[moved] ** 2).mean() > 1.5
     R, _ = wrong.poses(motions.in_a_room(12.0, np.random.default_rng(0)), np.array([5.0]))
@@ -139,7 +139,7 @@ def test_a_known_offset_is_told():
     camera = replace(EXACT.camera, time_offset_s=0.05)
     session = recorded(camera=camera)
     r, baseline = misses(session, replace(EXACT, camera=camera))
-    assert (r[baseline > 0.02] ** 2).mean() == pytest.approx(1.0, abs=0.1)
+    assert (r[baseline > 0.04] ** 2).mean() == pytest.approx(1.0, abs=0.1)
     assert session.calibration.cameras["cam0"].time_offset_s == 0.05
 
 
