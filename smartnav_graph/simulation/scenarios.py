@@ -1,4 +1,13 @@
-"""The named scenarios, each a `Scenario` that a seed turns into a session with its truth; see `recording`."""
+"""The named scenarios, each a `Scenario` that a seed turns into a session with its truth; see `recording`.
+
+With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min (matches of adjacent images; its
+constants are frozen). These start at rest in the origin facing north and are told no position: a start without fixes
+takes just that for granted, in batch and replay alike, so that errors are those of the whole way. The trolley rests for
+three minutes and stops ten times for ten seconds; at corners it halts for 0.8 s before and after it is turned, too
+briefly to be found at rest, so that the listed halts hold its velocity and not its heading. Without standstills:
+``--standstill.zupt False --standstill.zaru False``. A wrong boresight or camera clock, of which the session is told
+nothing: ``replace(scenario, camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
+"""
 
 from __future__ import annotations
 
