@@ -14,6 +14,7 @@ from smartnav_graph.assemble import Withheld, densify
 from smartnav_graph.config import Config, RunConfig
 from smartnav_graph.errors import SessionError
 from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.losses import huber_limit
 from smartnav_graph.session import Mount
 from smartnav_graph.timebase import NS
 
@@ -91,7 +92,7 @@ def test_huber_weights_are_told(eight):
     lla[30, 0] += 80.0 / 111_200.0
     solution = sn.smooth(with_gnss(eight, lla=lla), Config(gnss=GnssConfig(loss="huber")))
     weight = solution.residuals.weight[solution.residuals.of("gnss")].reshape(-1, 3)
-    assert weight[30] == pytest.approx(np.full(3, 1.345 / 80.0), rel=0.05)
+    assert weight[30] == pytest.approx(np.full(3, huber_limit(3) / 80.0), rel=0.05)
     assert weight.max() == 1.0
 
 

@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
 # Share of its matches that a pair must keep.
 LEAST_SHARE = 0.5
-# Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, once more and compressed.
+# Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, again and compressed.
 COMPRESSED = 3
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5

@@ -8,7 +8,8 @@ The second is what is called a zero angular rate update: with the inertial facto
 its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias would let wander.
 A standstill that is none must not bend the trajectory. Steady travel looks like rest: there a row that contradicts
 what else is known lets go (Geman, McClure: the force falls with the cube of the residual). Where a replay knows how
-little it knows, after a minute of dead reckoning, a speed that is merely unknown contradicts nothing. A foot's stance is at worst a slower one: beyond `TAIL` sigmas the force is constant.
+little it knows, after a minute of dead reckoning, a speed that is merely unknown contradicts nothing. A foot's stance
+is at worst a slower one: beyond `TAIL` sigmas the force is constant.
 
 Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, IEEE CG&A 25(6); Skog et al. (2010).
 """
