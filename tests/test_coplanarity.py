@@ -90,7 +90,8 @@ def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     slipped = replace(tracks, xy_n=tracks.xy_n + np.where(bad[:, None], [17 / 575, 0.0], 0.0), xy_px=None)
     run = smooth(room.replace(tracks=slipped), options())
     metres, degrees = errors(run.solution, room.reference)
-    assert metres < 0.05 and degrees < 0.3
+    clean = errors(seen.solution, room.reference)
+    assert metres < clean[0] + 0.02 and degrees < clean[1] + 0.1
     builder = next(b for b in run.problem.builders if b.name == "coplanarity")
     touched = (builder.pairs.t_ns[builder.pairs.images] == one).any(axis=1)
     assert touched.sum() == 8 and not (builder.verdict[touched] == IN_USE).any()

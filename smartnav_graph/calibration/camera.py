@@ -32,6 +32,7 @@ class Camera:
     width, height : px, of the images it speaks of; fx, fy, cx, cy : px
     noise_px : sigma of a good match, px an axis; time_offset_s : a frame stamped t shows IMU time t + offset;
     readout_s : from the first row to the last, 0 for a global shutter
+    boresight_sigma_deg, time_offset_sigma_s : how sure its attitude in the body (of the session) and its clock are
     """
 
     width: int
@@ -45,6 +46,8 @@ class Camera:
     noise_px: float = 0.7
     time_offset_s: float = 0.0
     readout_s: float = 0.0
+    boresight_sigma_deg: float = 0.5
+    time_offset_sigma_s: float = 0.02
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, self.time_offset_s, self.readout_s)
@@ -55,7 +58,9 @@ class Camera:
                 f"{len(self.distortion)} distortion coefficients for model {self.model!r}",
                 " or ".join(map(str, MODELS[self.model])),
             )
-        positive = min(self.width, self.height, self.fx, self.fy, self.noise_px) > 0 and self.readout_s >= 0
+        numbers = (*numbers, self.boresight_sigma_deg, self.time_offset_sigma_s)
+        positive = min(self.width, self.height, self.fx, self.fy, self.noise_px) > 0
+        positive &= min(self.readout_s, self.boresight_sigma_deg, self.time_offset_sigma_s) >= 0
         if not (positive and all(map(math.isfinite, numbers))):
             raise self._error(f"{self}", "finite numbers; sizes, focal lengths and noise > 0", "give pixels")
 

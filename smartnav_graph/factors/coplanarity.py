@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
@@ -37,8 +38,8 @@ LEAST_SHARE = 0.5
 COMPRESSED = 3
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
-# Sigma of a match in normalised coordinates where no camera is calibrated: 0.7 px of a phone's 640 x 480.
-UNKNOWN_CAMERA = 1.5e-3
+# Stands in where no camera is calibrated: a phone's at 640 x 480.
+UNKNOWN_CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class CoplanarityConfig:
     """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
     least_parallax (rad, median once the turn is taken out) : of a pair; reach : of the Cauchy loss of a match, sigmas;
     compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's
-    attitude in the body and of its clock as states (zero: as calibrated)."""
+    attitude in the body and of its clock as states (zero: known; none given: as sure as the calibration says)."""
 
     enabled: bool = True
     rate_hz: float = 4.0
@@ -55,14 +56,15 @@ class CoplanarityConfig:
     least_parallax: float = 0.01
     reach: float = 2.0
     compress: bool = True
-    boresight_sigma_deg: float = 0.0
-    time_offset_sigma: float = 0.02
+    boresight_sigma_deg: float | None = None
+    time_offset_sigma: float | None = None
 
     def __post_init__(self) -> None:
         if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1 and self.least_matches >= POSE_DOF):
             found = f"rate_hz = {self.rate_hz}, spans = {self.spans}, least_matches = {self.least_matches}"
             raise ConfigError("config [coplanarity]", found, f"> 0, whole numbers >= 1, at least {POSE_DOF}")
-        if not (self.reach > 0 and min(self.least_parallax, self.boresight_sigma_deg, self.time_offset_sigma) >= 0):
+        given = (self.least_parallax, self.boresight_sigma_deg or 0.0, self.time_offset_sigma or 0.0)
+        if not (self.reach > 0 and min(given) >= 0):
             raise ConfigError("config [coplanarity]", f"{self}", "reach > 0, parallax and sigmas >= 0")
 
 
@@ -82,7 +84,7 @@ class CoplanarityBuilder:
     """Adds the pairs that end at a keyframe.
 
     image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; rate (k, 3) rad/s : of the body
-    sigma : of a match, normalised
+    sigma : of a match, normalised; boresight_sigma rad, clock_sigma s : of the states of the camera
     verdict (n,) : what became of each pair, places in `REASONS`; at_once (n,) : the same as a replay judged
     refused : why none is used, in words; frozen : relative poses of the pairs where their inliers were settled
     """
@@ -91,6 +93,8 @@ class CoplanarityBuilder:
     image_ns: NDArray[np.int64]
     rig: Rig
     sigma: float
+    boresight_sigma: float
+    clock_sigma: float
     merge_ns: int
     config: CoplanarityConfig = field(default_factory=CoplanarityConfig)
     note: str = ""
@@ -170,10 +174,10 @@ class CoplanarityBuilder:
 
     def _states(self) -> list[SessionState]:
         """Session states of the camera."""
-        sigma = np.full(3, np.radians(self.config.boresight_sigma_deg))
+        sigma = np.full(3, self.boresight_sigma)
         found = []
         if self.rig.timed:
-            found.append(clock_state("images", self.config.time_offset_sigma))
+            found.append(clock_state("images", self.clock_sigma))
         if self.rig.boresight:
             found.append(SessionState("A", "images", "camera_boresight_rad", np.zeros(3), sigma))
         return found
@@ -236,12 +240,22 @@ def build(context: FactorContext) -> CoplanarityBuilder | None:
     if pairs is None or not len(pairs):
         return None
     mount = context.session.mount(context.camera_name)
+    degrees, seconds = config.boresight_sigma_deg, config.time_offset_sigma
+    degrees = (camera or UNKNOWN_CAMERA).boresight_sigma_deg if degrees is None else degrees
+    seconds = (camera or UNKNOWN_CAMERA).time_offset_sigma_s if seconds is None else seconds
     rig = Rig(
         np.array(mount.body_R, dtype=np.float64),
         np.array(mount.body_t, dtype=np.float64),
-        boresight=config.boresight_sigma_deg > 0,
-        timed=config.time_offset_sigma > 0,
+        boresight=degrees > 0,
+        timed=seconds > 0,
     )
-    sigma = UNKNOWN_CAMERA if camera is None else camera.noise
-    merge = round(context.config.keyframes.merge_s * NS)
-    return CoplanarityBuilder(pairs, context.image_ns, rig, sigma, merge, config)
+    return CoplanarityBuilder(
+        pairs,
+        context.image_ns,
+        rig,
+        sigma=(camera or UNKNOWN_CAMERA).noise,
+        boresight_sigma=float(np.radians(degrees)),
+        clock_sigma=seconds,
+        merge_ns=round(context.config.keyframes.merge_s * NS),
+        config=config,
+    )

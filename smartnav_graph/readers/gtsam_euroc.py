@@ -7,12 +7,17 @@ T_BS of the set's cam0. Stamps carry 17 digits, so they differ from the original
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.errors import SessionError
+from smartnav_graph.readers.euroc import calibrated
 from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, mount, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session import Device, Mount, Session
@@ -20,6 +25,8 @@ from smartnav_graph.session import Device, Mount, Session
 NAME = "gtsam-euroc"
 FILE = "eqvio_processed_30s.csv"
 CAMERA = "cam0"
+DEVICE = "EuRoC VI-Sensor ADIS16448"
+SIZE = (752, 480)
 GRAVITY = 9.81
 
 _HEADING = "row_type,t_abs,t_rel,seq,frame_idx,landmark_id,"
@@ -43,13 +50,15 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         "images": (path, _image_columns(features)),
         "tracks": (path, _track_columns(features)),
     }
+    meta = _meta(table)
     return build_session(
         tables,
         repairs,
-        device=Device(name="EuRoC VI-Sensor ADIS16448", forward="+z", up="+x"),
+        calibration=Calibration(device=DEVICE, cameras={CAMERA: _camera(meta)}),
+        device=Device(name=DEVICE, forward="+z", up="+x"),
         clock_epoch="unix",
         gravity_m_s2=GRAVITY,
-        sensors={CAMERA: _mount(table.where("row_type", "meta"))},
+        sensors={CAMERA: _mount(meta)},
     )
 
 
@@ -80,14 +89,37 @@ def _track_columns(features: TextTable) -> Columns:
     }
 
 
-def _mount(meta: TextTable) -> Mount:
-    values = dict(zip(meta.texts("key"), meta.texts("value"), strict=True))
-    names = [f"T_ci_{name}" for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
-    try:
-        t, q = np.split(np.array([float(values[name]) for name in names]), [3])
-    except (KeyError, ValueError) as error:
-        raise SessionError(meta.path, f"camera extrinsics: {error}", f"meta rows {', '.join(names)}") from error
+@dataclass(frozen=True)
+class _Meta:
+    """The meta rows of a file."""
+
+    path: Path
+    values: Mapping[str, str]
+
+    def numbers(self, what: str, names: Sequence[str]) -> list[float]:
+        try:
+            return [float(self.values[name]) for name in names]
+        except (KeyError, ValueError) as error:
+            raise SessionError(self.path, f"{what}: {error}", f"meta rows {', '.join(names)}") from error
+
+
+def _meta(table: TextTable) -> _Meta:
+    rows = table.where("row_type", "meta")
+    return _Meta(rows.path, dict(zip(rows.texts("key"), rows.texts("value"), strict=True)))
+
+
+def _mount(meta: _Meta) -> Mount:
+    t, q = np.split(
+        np.array(meta.numbers("camera extrinsics", [f"T_ci_{n}" for n in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")])),
+        [3],
+    )
     return mount(t, Rotation.from_quat(q).as_matrix())
+
+
+def _camera(meta: _Meta) -> Camera:
+    """The points are undistorted already."""
+    fx, fy, cx, cy = meta.numbers("camera intrinsics", [f"camera_{n}" for n in ("fx", "fy", "cx", "cy")])
+    return calibrated(*SIZE, fx, fy, cx, cy)
 
 
 READER = Reader(
