@@ -13,6 +13,8 @@ vision-frontend   101 textured pictures of 640 x 480 with noise from disk, ORB 1
                   processors (wall seconds); baseline: scripts/bare_front_end.py, OpenCV's own calls in one process
 two-view          one pair of 300 matches, 30 % wrong, to kind, pose and covariance; baseline: scripts/bare_two_view.py,
                   OpenCV's findEssentialMat and recoverPose alone
+vision-solve      what image pairs cost a batch run of 20 min (pairs of 50 matches at 1.54 Hz) beyond the same run
+                  without images; baseline: scripts/bare_vision_solve.py, CustomFactors in GTSAM's own Levenberg-Marquardt
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+IMAGE_PERIOD_S = 0.65
 HERE = Path(__file__).resolve().parent
 MINUTES = 37
 
@@ -71,6 +74,11 @@ def bare_two_view() -> Measured:
     return Measured(told.pop("seconds"), None, told)
 
 
+def bare_vision_solve(session: str) -> Measured:
+    told = python(str(HERE / "bare_vision_solve.py"), "solve", session)
+    return Measured(told["seconds"], None, told)
+
+
 def ours(kind: str, session: str) -> Measured:
     told = python(str(HERE / "benchmark.py"), "--measure", kind, session)
     return Measured(told["seconds"], told["peak_memory_mb"], told["detail"])
@@ -88,6 +96,13 @@ def measure(kind: str, path: str) -> None:
     from smartnav_graph import estimate  # imports are not measured
 
     session, config = sn.load(path), sn.Config()
+    alone = 0.0
+    if kind == "vision":  # the same keyframes without images
+        spacing = replace(config.keyframes, max_spacing_s=IMAGE_PERIOD_S)
+        without = replace(config, coplanarity=replace(config.coplanarity, enabled=False), keyframes=spacing)
+        begin = time.process_time()
+        estimate.smooth(session, without)
+        alone = time.process_time() - begin
     if kind == "batch":
         gnss = replace(config.gnss, estimate_sigma=False, time_offset_sigma=0.0)
         imu, run = replace(config.imu, estimate_noise=False), replace(config.run, vehicle="none")
@@ -100,7 +115,8 @@ def measure(kind: str, path: str) -> None:
     assert run.solution.covariance.shape == (len(run.solution), 15, 15)
     keys = ("keyframes", "iterations", "passes", "converged", "timings_s", "update_ms")
     detail = {key: run.summary[key] for key in keys if key in run.summary}
-    detail["cpu_s"] = round(seconds, 4)
+    detail |= {"cpu_s": round(seconds, 4), "without_images_s": round(alone, 4)}
+    seconds -= alone
     if kind == "replay":
         seconds = run.summary["update_ms"]["p99"] / 1e3
     tell(seconds, detail)
@@ -194,6 +210,10 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
         pictures = folder / "pictures"
         subprocess.run([sys.executable, str(HERE / "bare_front_end.py"), "make", str(pictures)], check=True)
         return lambda: ours("front-end", str(pictures)), lambda: bare_front_end(str(pictures)), {}
+    if name == "vision-solve":
+        trolley = str(folder / "trolley")
+        subprocess.run([sys.executable, str(HERE / "bare_vision_solve.py"), "make", trolley], check=True)
+        return lambda: ours("vision", trolley), lambda: bare_vision_solve(trolley), {}
     if name == "two-view":
         return lambda: ours("two-view", "simulated"), bare_two_view, {}
     return lambda: ours("replay", "gtsam-kitti"), bare_fixed_lag, {}
@@ -216,7 +236,10 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
     }
 
 
-NAMES = ("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag", "vision-frontend", "two-view")
+NAMES = (
+    *("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag"),
+    *("vision-frontend", "two-view", "vision-solve"),
+)
 
 
 def main() -> None:

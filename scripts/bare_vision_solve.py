@@ -1,0 +1,66 @@
+"""The baseline of solving image pairs: the same graph with one CustomFactor a pair in GTSAM's own Levenberg-Marquardt.
+
+    python scripts/bare_vision_solve.py make FOLDER     the session: a trolley of 20 min, 50 matches a pair, 1.54 Hz
+    python scripts/bare_vision_solve.py solve FOLDER    one JSON line: processor seconds of the optimiser alone
+
+The graph is that of the last pass of a batch run (matches settled, pairs compressed); it starts from inertial data and
+standstills alone, as the batch run does.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import replace
+
+import gtsam
+
+import smartnav_graph as sn
+from smartnav_graph import estimate
+from smartnav_graph.problem import prepare
+from smartnav_graph.simulation.scenarios import SCENARIOS
+from smartnav_graph.smoothers.whole_graph import custom_factor, session_prior
+
+SCENARIO, PERIOD_S, MATCHES = "trolley-20min", 0.65, 50
+
+
+def make(folder: str) -> None:
+    scenario = SCENARIOS[SCENARIO]
+    camera = replace(scenario.camera, rate_hz=1.0 / PERIOD_S, count=(MATCHES, MATCHES))
+    sn.save(replace(scenario, camera=camera)(0), folder, force=True)
+
+
+def solve(folder: str) -> dict[str, float]:
+    config = sn.Config()
+    problem = prepare(sn.load(folder), config)
+    initial = estimate.initialise(problem)
+    builders = [initial.prior, *problem.builders]
+    start, memory = estimate._window_by_window(problem, problem.windows, builders, initial.memory)
+    found, _, _ = estimate.solve_passes(problem, problem.windows, initial.prior, memory, warm=start)
+    graph, held = gtsam.NonlinearFactorGraph(), {}
+    for _, factor in found.factors:
+        graph.push_back(factor)
+    pairs = 0
+    for block in found.blocks:
+        for row in (k for k, used in enumerate(block.used) if used):
+            graph.push_back(custom_factor(block, row, held))
+            pairs += 1
+    values = gtsam.Values(start)
+    for builder in problem.builders:
+        for state in builder._states() if builder.name == "coplanarity" else ():
+            graph.push_back(session_prior(state))
+            values.insert(state.key, state.initial)
+    begin = time.process_time()
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values)
+    end = optimiser.optimize()
+    seconds = time.process_time() - begin
+    assert abs(graph.error(end) - found.cost) < 0.05 * found.cost + 10.0, (graph.error(end), found.cost)
+    return {"seconds": seconds, "iterations": optimiser.iterations(), "pairs": pairs, "cost": graph.error(end)}
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "make":
+        make(sys.argv[2])
+    else:
+        print(json.dumps(solve(sys.argv[2])))
