@@ -14,7 +14,7 @@ vision-frontend   101 textured pictures of 640 x 480 with noise from disk, ORB 1
 two-view          one pair of 300 matches, 30 % wrong, to kind, pose and covariance; baseline: scripts/bare_two_view.py,
                   OpenCV's findEssentialMat and recoverPose alone
 vision-solve      what image pairs cost a batch run of 20 min (pairs of 50 matches at 1.54 Hz) beyond the same run
-                  without images; baseline: scripts/bare_vision_solve.py, CustomFactors in GTSAM's own Levenberg-Marquardt
+                  without images; baseline: scripts/bare_vision_solve.py, CustomFactors in GTSAM's own optimiser
 """
 
 from __future__ import annotations
