@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from smartnav_graph.assemble import Withheld, carried_over, causal_solution, densify, score, to_solution, used_counts
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SolverError
+from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_state import initialiser_of
@@ -100,6 +102,15 @@ def one_pass(
             smoother.update(build_step(window, smoother.latest(), builders, memory, problem.session.t0_ns))
 
 
+def _settled_pairs(smoother: Batch, builders: Sequence[Builder], memory: Memory) -> Memory:
+    """Judge image pairs again and again at what they lead to, all else as it is; the memory with what was found."""
+    pairs = next((b for b in builders if isinstance(b, CoplanarityBuilder)), None)
+    while pairs is not None and 0 < memory.settled.get(pairs.name, 0) < COMPRESSED:
+        memory = settled(builders, smoother.provisional(), memory)
+        smoother.renewed(partial(pairs.renew, memory=memory))
+    return memory
+
+
 @contextmanager
 def _no_collection() -> Iterator[None]:
     """Pause Python's garbage collector: a pass makes thousands of small objects that stay, and no cycles."""
@@ -140,6 +151,7 @@ def solve_passes(
         progress("solve", count - 1, most)
         smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
         one_pass(smoother, windows, builders, memory, problem)
+        memory = _settled_pairs(smoother, problem.builders, memory)
         estimate = smoother.estimate()
         if clock is not None:
             _account(clock, estimate, problem.builders)

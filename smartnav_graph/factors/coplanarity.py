@@ -128,20 +128,32 @@ class CoplanarityBuilder:
         bias = np.zeros(3) if previous is None else previous.bias.gyroscope()
         self._keyframe[image], self._turn[image] = window.index, self._now
         self.rate[image] = window.gyro[-1] - bias if len(window.gyro) else np.zeros(3)
-        first, last = np.searchsorted(self.pairs.images[:, 1], [image, image + 1])
-        ending = [k for k in range(first, last) if int(self.pairs.images[k, 0]) in self._keyframe]
-        if ending:
-            self._add_pairs(step, window, np.array(ending, dtype=np.intp), memory)
+        ending = self._ending(image)
+        if memory.phase == "causal" and len(ending):
+            self._judge_now(self._model(memory), ending)
+        self._add_pairs(step, ending, memory)
 
-    def _add_pairs(self, step: Step, window: Window, ending: NDArray[np.intp], memory: Memory) -> None:
-        model = self._model(memory)
-        if memory.phase == "causal":
-            self._judge_now(model, ending)
+    def renew(self, step: Step, memory: Memory) -> None:
+        """The pairs of a step once more, as what was learnt since has them."""
+        image = self._image_at(step.t_ns)
+        if image is not None:
+            step.blocks = [block for block in step.blocks if block.sensor != self.name]
+            self._add_pairs(step, self._ending(image), memory)
+            step.hold(memory.held)
+
+    def _ending(self, image: int) -> NDArray[np.intp]:
+        """Pairs whose second image this is, and whose first one has a keyframe."""
+        first, last = np.searchsorted(self.pairs.images[:, 1], [image, image + 1])
+        return np.array(
+            [k for k in range(first, last) if int(self.pairs.images[k, 0]) in self._keyframe], dtype=np.intp
+        )
+
+    def _add_pairs(self, step: Step, ending: NDArray[np.intp], memory: Memory) -> None:
         verdict = self.verdict_of(memory)
         ending = ending[np.isin(verdict[ending], [IN_USE, CONTRARY])]
         if not len(ending):
             return
-        used = tuple((verdict[ending] == IN_USE).tolist())
+        model, used = self._model(memory), tuple((verdict[ending] == IN_USE).tolist())
         states = {state.letter: state for state in self._states()}
         keys, data = [], np.empty((len(ending), COLUMNS))
         for row, pair in enumerate(ending):
@@ -151,7 +163,7 @@ class CoplanarityBuilder:
             of = {"X": own, "V": speed}
             keys.append(tuple(next(of[a]) if a in of else step.use(states[a]) for a in self.rig.letters))
             data[row] = [pair, *self.rate[images].ravel()]
-        step.blocks.append(Block(self.name, model, keys, data, window.t1_ns, rows=tuple(ending.tolist()), used=used))
+        step.blocks.append(Block(self.name, model, keys, data, step.t_ns, rows=tuple(ending.tolist()), used=used))
 
     def verdict_of(self, memory: Memory) -> NDArray[np.intp]:
         """What became of each pair (n,) in a pass with this memory."""

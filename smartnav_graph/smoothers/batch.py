@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -15,6 +15,7 @@ from smartnav_graph.errors import ConfigError, SolverError
 from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
 from smartnav_graph.smoothers.estimate import (
     Estimate,
+    Posterior,
     chronological_order,
     copy_state,
     eliminated,
@@ -214,25 +215,53 @@ class Batch:
         SolverError
             Not observable, not finite or not converged; names time, state and sensors.
         """
-        indices, order = [step.index for step in self.steps], chronological_order(self.steps)
-        shoot = self._shoot if self.unsure else None
         begin = time.perf_counter()
         try:
-            graph = WholeGraph.of(self.steps)
-            solve = minimise(graph, self.values, order, self.solve, shoot)
-            if not self.unsure and self._refresh(solve.values):
-                graph = WholeGraph.of(self.steps)
-                solve = minimise(graph, solve.values, order, self.solve)
+            graph, solve = self._solved(self.solve)
             solved = time.perf_counter()
             marginals = posterior(eliminated(graph, solve.values, self.steps), self.steps)
-            covariance = marginals.nav(states_of(solve.values, indices)[0])
+            covariance = marginals.nav(states_of(solve.values, [step.index for step in self.steps])[0])
         except RuntimeError as error:
             raise self._explain(error) from error
         check_covariance(covariance, self.steps, self.t0_ns)
+        seconds = {"solve": self._settle_s + solved - begin, "covariance": time.perf_counter() - solved}
+        return self._told(solve, covariance, marginals, seconds)
+
+    def provisional(self) -> Estimate:
+        """Solve everything coarsely, without any covariance (zeros); errors as `estimate`."""
+        begin = time.perf_counter()
+        try:
+            _, solve = self._solved(COARSE)
+        except RuntimeError as error:
+            raise self._explain(error) from error
+        self._settle_s += time.perf_counter() - begin
+        none = np.zeros((len(self.steps), 15, 15))
+        blank = {name: np.zeros((len(state.initial),) * 2) for name, state in session_states(self.steps).items()}
+        return self._told(solve, none, Posterior(none, none[1:], blank), {})
+
+    def renewed(self, renew: Callable[[Step], None]) -> None:
+        """Change what the steps add; a session state that comes with it begins at its prior mean."""
+        for step in self.steps:
+            renew(step)
+            for name, state in step.session.items():
+                if not self.values.exists(name):
+                    self.values.insert(name, state.initial)
+
+    def _solved(self, precision: SolveConfig) -> tuple[WholeGraph, Solve]:
+        """Everything solved from the present values, which then are the solution."""
+        order, shoot = chronological_order(self.steps), self._shoot if self.unsure else None
+        graph = WholeGraph.of(self.steps)
+        solve = minimise(graph, self.values, order, precision, shoot)
+        if not self.unsure and self._refresh(solve.values):
+            graph = WholeGraph.of(self.steps)
+            solve = minimise(graph, solve.values, order, precision)
         self.values = solve.values
+        return graph, solve
+
+    def _told(self, solve: Solve, covariance: Any, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
         return Estimate(
             values=solve.values,
-            indices=indices,
+            indices=[step.index for step in self.steps],
             t_ns=np.array([step.t_ns for step in self.steps], dtype=np.int64),
             covariance=covariance,
             factors=[item for step in self.steps for item in step.factors],
@@ -242,10 +271,7 @@ class Batch:
             cost=solve.cost,
             session=session_values(self.steps, solve.values, marginals),
             marginals=marginals,
-            seconds={
-                "solve": self._settle_s + solved - begin,
-                "covariance": time.perf_counter() - solved,
-            },
+            seconds=seconds,
         )
 
     def _explain(self, error: RuntimeError) -> SolverError:
