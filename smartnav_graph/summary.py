@@ -250,7 +250,9 @@ def _standstills(problem: Problem) -> dict[str, Any]:
         for name, spans in found.items()
     }
     seconds = {name: round(sum(b - a for a, b in spans) / 1e9, 3) for name, spans in inside.items()}
-    return {"count": len(inside["total_s"]), **seconds, "on_foot": rests.on_foot}
+    t0 = problem.session.t0_ns
+    spans = [[round((a - t0) / 1e9, 3), round((b - t0) / 1e9, 3)] for a, b in inside["total_s"]]
+    return {"count": len(spans), **seconds, "on_foot": rests.on_foot, "spans_s": spans}
 
 
 def _sigma_summary(solution: Solution) -> dict[str, float]:

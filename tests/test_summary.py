@@ -95,6 +95,7 @@ def test_standstills_are_told(summary):
     found = summary["standstills"]
     assert found["count"] == 1 and not found["on_foot"]
     assert 5.0 <= found["at_rest_s"] <= found["total_s"] <= 6.0
+    assert found["spans_s"] == [[0.0, found["total_s"]]]
 
 
 def test_initialisation_is_told(summary):

@@ -42,6 +42,8 @@ SENSORS = {
     "images": ("Images", "image", "images"),
     "tracks": ("Tracked points", "tracked point", "tracked points"),
     "matches": ("Matched points", "matched point", "matched points"),
+    "coplanarity": ("Image pairs", "image pair", "image pairs"),
+    "static_turn": ("Rests without turn", "rest without turn", "rests without turn"),
 }
 HOLES = {"bridged": "bridged by interpolation", "missing": "no samples"}
 MODES = {

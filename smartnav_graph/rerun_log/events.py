@@ -40,18 +40,26 @@ def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]
     start, end = span(session, solution)
     use = fix_use(session.gnss, solution)
     fixes = session.gnss.t_ns[use == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
-    static = session.static
     return Events(
         t0_ns=session.t0_ns,
         start_ns=start,
         end_ns=end,
         gaps=imu_gaps(session, summary),
         outages=silences(fixes, start, end) if session.gnss is not None else [],
-        standstills=[]
-        if static is None
-        else [Gap(int(a), int(b), "still") for a, b in zip(static.t_ns, static.t_end_ns, strict=True)],
+        standstills=_standstills(session, summary),
         fix_use=use,
     )
+
+
+def _standstills(session: Session, summary: Mapping[str, Any]) -> list[Gap]:
+    """Standstills as the estimator told them, else as they are listed."""
+    if "standstills" in summary:
+        spans = ns_from_seconds(np.array(summary["standstills"].get("spans_s", [])).reshape(-1, 2)) + session.t0_ns
+    elif session.static is not None:
+        spans = np.stack([session.static.t_ns, session.static.t_end_ns], axis=1)
+    else:
+        return []
+    return [Gap(int(a), int(b), "still") for a, b in spans]
 
 
 def span(session: Session, solution: Solution | None) -> tuple[int, int]:
