@@ -51,6 +51,10 @@ def settled(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> 
 
 def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> Memory:
     passed, scale = memory.settled.get(builder.name, 0), memory.scale(builder.name)
+    bias = estimate.states()[3][
+        np.clip(np.searchsorted(estimate.t_ns, builder.image_ns), 0, len(estimate.t_ns) - 1), 3:
+    ]
+    builder.rate[:] = builder.rates(builder.image_ns, estimate.offset_s("images")) - bias
     there, inside = relative_poses(builder, estimate)
     if passed == 0:
         use, verdict = builder.by_turn(builder.pairs, there.R)

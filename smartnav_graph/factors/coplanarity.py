@@ -12,6 +12,7 @@ factor in a graph after Indelman, Roberts, Beall, Dellaert (2012), Incremental l
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matche
 from smartnav_graph.factors.gnss import clock_state
 from smartnav_graph.factors.observation import exp
 from smartnav_graph.graph import Block, Memory, RowModel, SessionState, State, Step, Window, key
-from smartnav_graph.timebase import NS
+from smartnav_graph.streams import Imu
+from smartnav_graph.timebase import NS, seconds_since
 from smartnav_graph.vision.gating import gate
 from smartnav_graph.vision.pairs import Pairs
 
@@ -36,6 +38,8 @@ TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
 LEAST_SHARE = 0.5
 # Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, again and compressed.
 COMPRESSED = 3
+# A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
+AROUND_S = 0.005
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
 # Stands in where no camera is calibrated: a phone's at 640 x 480.
@@ -84,6 +88,7 @@ class CoplanarityBuilder:
     """Adds the pairs that end at a keyframe.
 
     image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; rate (k, 3) rad/s : of the body
+    from there to the offset found; gyro : the inertial data
     sigma : of a match, normalised; boresight_sigma rad, clock_sigma s : of the states of the camera
     verdict (n,) : what became of each pair, places in `REASONS`; at_once (n,) : the same as a replay judged
     refused : why none is used, in words; frozen : relative poses of the pairs where their inliers were settled
@@ -91,6 +96,7 @@ class CoplanarityBuilder:
 
     pairs: Pairs
     image_ns: NDArray[np.int64]
+    gyro: Imu
     rig: Rig
     sigma: float
     boresight_sigma: float
@@ -125,9 +131,9 @@ class CoplanarityBuilder:
         image = self._image_at(window.t1_ns)
         if image is None:
             return
-        bias = np.zeros(3) if previous is None else previous.bias.gyroscope()
         self._keyframe[image], self._turn[image] = window.index, self._now
-        self.rate[image] = window.gyro[-1] - bias if len(window.gyro) else np.zeros(3)
+        if memory.phase == "causal" and previous is not None:
+            self.rate[image] = self.rates(self.image_ns[image : image + 1], 0.0)[0] - previous.bias.gyroscope()
         ending = self._ending(image)
         if memory.phase == "causal" and len(ending):
             self._judge_now(self._model(memory), ending)
@@ -214,6 +220,25 @@ class CoplanarityBuilder:
         use = memory.used("matches", np.arange(len(self.pairs.pair)))
         return np.asarray(self.pairs.padded(use), dtype=bool)
 
+    def rates(self, t_ns: NDArray[np.int64], offset_s: float) -> Floats:
+        """Mean measured rates (m, 3) rad/s from stamps (m,) to an offset; around them where that is next to nothing."""
+        start, end = (0.0, offset_s) if abs(offset_s) > AROUND_S else (-AROUND_S, AROUND_S)
+        t = seconds_since(t_ns, int(self.gyro.t_ns[0]))
+        return np.asarray((self._turned_by(t + end) - self._turned_by(t + start)) / (end - start))
+
+    def _turned_by(self, t: Floats) -> Floats:
+        """Integral (m, 3) of the measured rate up to times (m,) s since the first sample."""
+        return np.stack([np.interp(t, self._seconds, column) for column in self._integral.T], axis=1)
+
+    @cached_property
+    def _seconds(self) -> Floats:
+        return seconds_since(self.gyro.t_ns, int(self.gyro.t_ns[0]))
+
+    @cached_property
+    def _integral(self) -> Floats:
+        steps = 0.5 * (self.gyro.gyro[1:] + self.gyro.gyro[:-1]) * np.diff(self._seconds)[:, None]
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
     # --- which matches ---
 
     def used_matches(self, memory: Memory) -> Mask:
@@ -264,6 +289,7 @@ def build(context: FactorContext) -> CoplanarityBuilder | None:
     return CoplanarityBuilder(
         pairs,
         context.image_ns,
+        context.session.require_imu(),
         rig,
         sigma=(camera or UNKNOWN_CAMERA).noise,
         boresight_sigma=float(np.radians(degrees)),
