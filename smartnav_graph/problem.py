@@ -249,7 +249,11 @@ def _unused(session: Session) -> list[str]:
     """Streams that are there but have no factor."""
     used = {*BUILDERS, "reference", "images", "tracks", "matches"}
     idle = [name for name in session.streams() if name not in used]
-    return [f"{name}: present, not used by the estimator" for name in idle]
+    told = [f"{name}: present, not used by the estimator" for name in idle]
+    images = session.images
+    if images is not None and session.matches is None and session.tracks is None and images.file.astype(bool).any():
+        told.append(f"images: {len(images)} pictures are not matched yet, and not used; run `smartnav match` first")
+    return told
 
 
 def _dropped_text(name: str, counts: Mapping[str, int]) -> str:
