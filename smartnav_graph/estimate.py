@@ -179,9 +179,11 @@ def _window_by_window(
         for window in windows:
             smoother.update(build_step(window, previous, builders, first, t0_ns))
             previous = smoother.known()
-    estimate = smoother.estimate()
     judged = replace(memory, settled={})
-    return estimate.values, judged if memory.stage < LAST_STAGE else settled(builders, estimate, judged)
+    if memory.stage < LAST_STAGE:
+        return smoother.values(), judged
+    estimate = smoother.estimate()
+    return estimate.values, settled(builders, estimate, judged)
 
 
 def _forget(builders: Sequence[Builder]) -> None:

@@ -51,9 +51,7 @@ def settled(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> 
 
 def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> Memory:
     passed, scale = memory.settled.get(builder.name, 0), memory.scale(builder.name)
-    bias = estimate.states()[3][
-        np.clip(np.searchsorted(estimate.t_ns, builder.image_ns), 0, len(estimate.t_ns) - 1), 3:
-    ]
+    bias = estimate.states()[3][_keyframes(builder, estimate)[0], 3:]
     builder.rate[:] = builder.rates(builder.image_ns, estimate.offset_s("images")) - bias
     there, inside = relative_poses(builder, estimate)
     if passed == 0:
@@ -84,8 +82,8 @@ def lost(builders: Iterable[Builder], estimate: Estimate) -> bool:
         if isinstance(builder, CoplanarityBuilder):
             there, inside = relative_poses(builder, estimate)
             sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
-            second = np.clip(np.searchsorted(estimate.t_ns, builder.image_ns), 0, len(sigma) - 1)
-            strays = sigma[second][builder.pairs.images[:, 1]] * builder.pairs.length_s
+            place, _ = _keyframes(builder, estimate)
+            strays = sigma[place][builder.pairs.images[:, 1]] * builder.pairs.length_s
             astray = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
             used = inside & (builder.verdict == IN_USE)
             return bool(used.any() and astray[used].mean() > FEW_ASTRAY)
@@ -139,11 +137,16 @@ def account(builders: Iterable[Builder], memory: Memory) -> Account | None:
     return None
 
 
-def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
-    """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
+def _keyframes(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[NDArray[np.intp], Mask]:
+    """Keyframe (k,) at each image, the next one where it has none, and which have one."""
     stamps = builder.image_ns
     place = np.clip(np.searchsorted(estimate.t_ns, stamps - builder.merge_ns), 0, len(estimate.t_ns) - 1)
-    known = np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+    return place, np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+
+
+def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
+    """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
+    place, known = _keyframes(builder, estimate)
     R, p, v, _ = (x[place] for x in estimate.states())
     pose = np.tile(np.eye(4), (len(place), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = R, p

@@ -16,6 +16,7 @@ from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.factors import BUILDERS
 from smartnav_graph.factors.bridging import bridged
 from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.pose_fix import at_their_time
 from smartnav_graph.graph import Builder, Window
 from smartnav_graph.keyframes import keyframe_times, make_windows
@@ -23,6 +24,7 @@ from smartnav_graph.session import Session
 from smartnav_graph.standstill import Standstills, find_standstills
 from smartnav_graph.streams import Positioned
 from smartnav_graph.timebase import NS, Gap, find_gaps
+from smartnav_graph.vision.pairs import Pairs
 from smartnav_graph.vision.still import still_periods
 from smartnav_graph.withhold import split
 
@@ -44,6 +46,7 @@ class Problem:
     dropped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     rests: Standstills | None = None
+    pairs: Pairs | None = None
 
     @property
     def vehicle(self) -> str:
@@ -111,10 +114,10 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
-    context = FactorContext(session, calibration, gaps, vehicle, config, None, causal)
-    seen = None if context.pairs is None else still_periods(context.pairs)
+    pairs = pairs_of(session, config.coplanarity)
+    seen = None if pairs is None else still_periods(pairs)
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still, seen)
-    context = replace(context, rests=rests)
+    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal, pairs)
     windows, lost = cut(context, span)
     for name, count in lost.items():
         dropped.setdefault(name, {})["arrived after the end"] = count
@@ -123,7 +126,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
         dropped[name] = {**dropped.get(name, {}), **counts}
     notes = [note for b in builders if (note := getattr(b, "note", ""))]
     warnings = [*warnings, *told, *notes, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
-    return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests)
+    return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests, pairs)
 
 
 def _calibrated(session: Session) -> Session:
@@ -165,7 +168,9 @@ def recut(problem: Problem, known_ns: int | None = None) -> Problem:
     merge = round(config.keyframes.merge_s * NS)
     if not gaps and not any(late.is_late(stream, merge).any() for stream in session.absolute().values()):
         return problem
-    context = FactorContext(session, problem.calibration, gaps, problem.vehicle, config, problem.rests)
+    context = FactorContext(
+        session, problem.calibration, gaps, problem.vehicle, config, problem.rests, pairs=problem.pairs
+    )
     windows, _ = cut(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
     if known_ns is not None:
         windows = late.forget(windows, session.streams(), known_ns)

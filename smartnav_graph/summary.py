@@ -48,7 +48,9 @@ def peak_memory_mb() -> float:
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
 
 
-def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution: Solution) -> dict[str, float]:
+def _chi2_per_dof(
+    problem: Problem, estimate: Estimate, memory: Memory, solution: Solution, seen: Account | None
+) -> dict[str, float]:
     """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
 
     Unknowns are the states less the equations that chains and priors bring with them. The redundancy of a fix is what
@@ -66,7 +68,6 @@ def _chi2_per_dof(problem: Problem, estimate: Estimate, memory: Memory, solution
     total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
     result = {"overall": 2.0 * estimate.cost / total}
     left = float(total)
-    seen = account(problem.builders, memory)
     if seen is not None and seen.redundancy > 0:
         left -= seen.redundancy
         inside = rows.get("coplanarity", np.zeros(0, dtype=bool))  # within their gate; the loss would make it too small
@@ -122,10 +123,10 @@ def summarise(
     for block in estimate.blocks:
         factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, memory))
-    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes)
+    seen = account(problem.builders, memory)
+    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes, seen)
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
-    seen = account(problem.builders, memory)
     told = [seen.refused] if seen is not None and seen.refused else []
     warnings = [*problem.warnings, *told, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
     summary: dict[str, Any] = {

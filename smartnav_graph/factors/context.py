@@ -17,14 +17,14 @@ from smartnav_graph.factors.bridging import Bridge
 from smartnav_graph.session import Session
 from smartnav_graph.standstill import Standstills
 from smartnav_graph.timebase import NS, Gap
-from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
+from smartnav_graph.vision.pairs import Pairs
 
 
 @dataclass(frozen=True)
 class FactorContext:
     """The session without its withheld rows, the device's calibration, holes of the inertial data, what carries the
     device (none, car, trolley, foot), the options of all rooms (`config.Config`, which stands below this room), the
-    standstills of the recording, and whether nothing may be learnt from what comes later (replay)."""
+    standstills of the recording, whether nothing may be learnt from what comes later (replay), and its image pairs."""
 
     session: Session
     calibration: Calibration
@@ -33,6 +33,7 @@ class FactorContext:
     config: Any
     rests: Standstills | None = None
     causal: bool = False
+    pairs: Pairs | None = None
 
     @cached_property
     def bridges(self) -> Mapping[int, Bridge]:
@@ -53,16 +54,6 @@ class FactorContext:
     def camera(self) -> Camera | None:
         """The calibration of that camera, where there is one."""
         return self.calibration.cameras.get(self.camera_name)
-
-    @cached_property
-    def pairs(self) -> Pairs | None:
-        """Pairs of images: as they were matched, else along tracks; None where images are not to be used."""
-        options, session = self.config.coplanarity, self.session
-        if not options.enabled:
-            return None
-        if session.matches is not None:
-            return of_matches(session.matches)
-        return None if session.tracks is None else of_tracks(session.tracks, options.rate_hz, options.spans)
 
     @property
     def image_ns(self) -> NDArray[np.int64]:

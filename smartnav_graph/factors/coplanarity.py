@@ -24,10 +24,11 @@ from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matche
 from smartnav_graph.factors.gnss import clock_state
 from smartnav_graph.factors.observation import exp
 from smartnav_graph.graph import Block, Memory, RowModel, SessionState, State, Step, Window, key
+from smartnav_graph.session import Session
 from smartnav_graph.streams import Imu
 from smartnav_graph.timebase import NS, seconds_since
 from smartnav_graph.vision.gating import gate
-from smartnav_graph.vision.pairs import Pairs
+from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -203,7 +204,7 @@ class CoplanarityBuilder:
     def _model(self, memory: Memory) -> RowModel:
         """The row model of a pass: made anew where what was learnt changed."""
         learnt = memory.rejected.get("matches"), memory.settled.get(self.name, 0), memory.scale(self.name), memory.phase
-        if self._made is None or any(a is not b and a != b for a, b in zip(self._made[0], learnt, strict=True)):
+        if self._made is None or self._made[0] != learnt:
             self._made = (learnt, self._new_model(memory))
         return self._made[1]
 
@@ -269,6 +270,15 @@ class CoplanarityBuilder:
         few = (pairs.count < self.config.least_matches) | ((share >= LEAST_SHARE) & (kept < self.config.least_matches))
         still, contrary = parallax < self.config.least_parallax, share < LEAST_SHARE
         return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
+
+
+def pairs_of(session: Session, config: CoplanarityConfig) -> Pairs | None:
+    """Image pairs of a session: as they were matched, else along tracks; None where images are not to be used."""
+    if not config.enabled:
+        return None
+    if session.matches is not None:
+        return of_matches(session.matches)
+    return None if session.tracks is None else of_tracks(session.tracks, config.rate_hz, config.spans)
 
 
 def build(context: FactorContext) -> CoplanarityBuilder | None:

@@ -85,7 +85,7 @@ class Stack:
             found: Measured = self.model.measured(self._states(values), self.data)
             return found._replace(used=found.used & self.used[found.row])
         white, _ = self.linearize(values)
-        return Measured(np.arange(len(white)), white, np.where(self.used, self.weight(white), 0.0), self.used)
+        return Measured(np.arange(len(white)), white, self.weight(white), self.used)
 
     def sizes(self, values: Any) -> Floats:
         """Norm (m,) of each whitened row; of one that stands for many measurements, their median."""
