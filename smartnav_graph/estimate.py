@@ -39,6 +39,7 @@ from smartnav_graph.smoothers.minimise import FIRST
 from smartnav_graph.solution import Solution
 from smartnav_graph.start import Given, Initial
 from smartnav_graph.summary import summarise
+from smartnav_graph.trace import Trace, UpdateLog, Updates
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -64,6 +65,7 @@ class Run:
     causal: Solution | None = None
     withheld: Mapping[str, Withheld] = field(default_factory=dict)
     causal_windows: Sequence[Window] = ()
+    trace: Trace | None = None
 
     @property
     def session(self) -> Session:
@@ -254,13 +256,14 @@ def _finish(
     clock: Clock,
     extra: Mapping[str, Any],
     causal: Solution | None = None,
+    updates: Updates | None = None,
 ) -> Run:
     keyframes = to_solution(problem, estimate, memory)
     withheld = score(problem, keyframes, estimate)
     solution = densify(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(problem, initial, estimate, memory, keyframes, withheld, clock.to_dict(), extra)
-    return Run(problem, solution, summary, causal, withheld)
+    return Run(problem, solution, summary, causal, withheld, trace=Trace.of(problem, estimate, memory, updates))
 
 
 def _refuse_empty(problem: Problem, memory: Memory) -> None:
@@ -294,7 +297,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.memory))
     memory = replace(initial.memory, phase="causal", correlated=wandering, stage=LAST_STAGE)
-    latency: list[float] = []
+    log = UpdateLog()
     states: list[State] = []
     interrupted = False
     total = len(problem.windows)
@@ -304,9 +307,10 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
                 progress("replay", window.index, total)
                 begin = time.perf_counter()
                 previous = states[-1] if states else None
-                smoother.update(build_step(window, previous, builders, memory, problem.session.t0_ns))
+                step = build_step(window, previous, builders, memory, problem.session.t0_ns)
+                smoother.update(step)
                 states.append(smoother.known())
-                latency.append(1e3 * (time.perf_counter() - begin))
+                log.take(step, smoother, time.perf_counter() - begin)
     except KeyboardInterrupt:
         interrupted = True
         if len(states) < 2:
@@ -314,10 +318,10 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     clock.lap("replay")
     problem = _counted(replace(problem, windows=problem.windows[: len(states)]), smoother.dropped)
     estimate = smoother.estimate(len(states))
-    causal, windows = causal_solution(problem, states), problem.windows
+    causal, windows, updates = causal_solution(problem, states), problem.windows, log.updates()
     extra: dict[str, Any] = {
         "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
-        "update_ms": {name: float(f(latency)) for name, f in _LATENCY.items()},
+        "update_ms": {name: float(f(log.latency_ms)) for name, f in _LATENCY.items()},
         "delay_s": initial.stretch_s,
     }
     if options.polish:
@@ -327,7 +331,8 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         except KeyboardInterrupt:
             extra["mode"] += ", polish interrupted"
         clock.lap("polish")
-    return replace(_finish(problem, initial, estimate, memory, clock, extra, causal), causal_windows=windows)
+    run = _finish(problem, initial, estimate, memory, clock, extra, causal, updates)
+    return replace(run, causal_windows=windows)
 
 
 def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:

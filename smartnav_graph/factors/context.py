@@ -43,12 +43,8 @@ class FactorContext:
 
     @cached_property
     def camera_name(self) -> str:
-        """The camera whose matches or tracks there are: that of the images, else the only one that is calibrated."""
-        images, known = self.session.images, self.calibration.cameras
-        if images is not None and len(images):
-            names, count = np.unique(images.camera.astype(str), return_counts=True)
-            return str(names[np.argmax(count)])
-        return next(iter(known), "camera")
+        """See `camera_name`."""
+        return camera_name(self.session, self.calibration)
 
     @property
     def camera(self) -> Camera | None:
@@ -67,3 +63,12 @@ class FactorContext:
     def on_foot(self) -> bool:
         """Whether the device is mounted on a walking foot: its stances hold speed and tilt."""
         return self.rests is not None and self.rests.on_foot
+
+
+def camera_name(session: Session, calibration: Calibration | None) -> str:
+    """The camera whose matches or tracks there are: that of the images, else the only one that is calibrated."""
+    images, known = session.images, {} if calibration is None else calibration.cameras
+    if images is not None and len(images):
+        names, count = np.unique(images.camera.astype(str), return_counts=True)
+        return str(names[np.argmax(count)])
+    return next(iter(known), "camera")

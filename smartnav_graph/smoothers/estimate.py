@@ -219,9 +219,8 @@ def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
     return Posterior(joint, following, later)
 
 
-def latest_covariance(net: Any, index: int) -> Floats:
-    """Covariance (15, 15) of keyframe `index`, the last that a Bayes net eliminates, on GTSAM's tangents."""
-    names = [key(letter, index) for letter in KEYFRAME_LETTERS]
+def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
+    """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents."""
     tail = (net.at(i) for i in range(net.size() - len(names), net.size()))
     return _Joint.empty().conditioned(_slices(names), {conditional.keys()[0]: conditional for conditional in tail})[0]
 

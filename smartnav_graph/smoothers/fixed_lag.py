@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.graph import KEYFRAME_LETTERS, Block, SessionState, State, Step, key, kind_of
 from smartnav_graph.smoothers.estimate import copy_state, latest_covariance, state_at
-from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
+from smartnav_graph.smoothers.incremental import Effort, Incremental, ReplayConfig, scalars
 from smartnav_graph.smoothers.whole_graph import WholeGraph, session_prior
 
 Floats = NDArray[np.float64]
@@ -62,11 +62,12 @@ class FixedLag(Incremental):
         order = self._order()
         names = list(self._live.keys())
         trust = np.concatenate([kind_of(name).trust for name in names])
-        for _ in range(MOST_STEPS):
+        for count in range(1, MOST_STEPS + 1):
             self._net = _eliminated(graph.linearize(self._live), order, self._weak)
             delta = self._net.optimize()
             _check(delta, names)
             self._live = self._live.retract(delta)
+            self.effort = Effort(len(names), count * len(names))
             if (np.abs(delta.vector()) < SETTLED * self.config.relinearize * trust).all():
                 break
 
@@ -123,7 +124,7 @@ class FixedLag(Incremental):
     def _order(self) -> gtsam.Ordering:
         """Chronological, the latest keyframe last of all: its marginal is then the end of the elimination."""
         latest = self._inside[-1]
-        own = [key(letter, latest.index) for letter in KEYFRAME_LETTERS]
+        own = _own(latest)
         order = gtsam.Ordering()
         for step in self._inside:
             for name in step.names():
@@ -137,16 +138,33 @@ class FixedLag(Incremental):
         return state_at(self._live, step.index, step.t_ns)
 
     def _marginal(self, step: Step) -> Floats:
-        joint = latest_covariance(self._net, step.index)
+        joint = latest_covariance(self._net, _own(step))
         sigma = np.sqrt(np.diag(joint))
         self._weak = not (sigma[:3].max() < WEAK_RAD and sigma[3:6].max() < WEAK_M)
         return joint
+
+    def session_now(self) -> dict[str, tuple[float, float]]:
+        """Present value and sigma of each scalar of the free session states, by name."""
+        found: dict[str, tuple[float, float]] = {}
+        if self._session:
+            names = [*self._session, *_own(self._inside[-1])]
+            sigma, start = np.sqrt(np.diag(latest_covariance(self._net, names))), 0
+            for name, state in self._session.items():
+                value = self._live.atVector(name)
+                found |= scalars(state, value, sigma[start : start + len(value)])
+                start += len(value)
+        return found
 
     def values(self) -> Any:
         """Best estimate of every state so far (gtsam.Values): as it left the lag, or as it is now."""
         values = gtsam.Values(self._left)
         values.insert(self._live)
         return values
+
+
+def _own(step: Step) -> list[int]:
+    """States of the body at one keyframe."""
+    return [key(letter, step.index) for letter in KEYFRAME_LETTERS]
 
 
 def _eliminated(linear: Any, order: gtsam.Ordering, weak: bool) -> Any:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import State, Step
+from smartnav_graph.graph import SessionState, State, Step
 from smartnav_graph.smoothers.estimate import (
     Estimate,
     eliminated,
@@ -45,13 +45,22 @@ class ReplayConfig:
             raise ConfigError("config [replay]", f"lag_s = {self.lag_s}", "> 0 s")
 
 
+class Effort(NamedTuple):
+    """What an update took: states solved for, and linearised anew (each time counts)."""
+
+    solved: int = 0
+    relinearised: int = 0
+
+
 class Incremental(ABC):
-    """A smoother that is right after every step. `dropped` counts rows, by sensor, that came too late for it."""
+    """A smoother that is right after every step. `dropped` counts rows, by sensor, that came too late for it; `effort`
+    is that of the last step."""
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         self.config, self.t0_ns = config, t0_ns
         self.steps: list[Step] = []
         self.dropped: Counter[str] = Counter()
+        self.effort = Effort()
 
     @abstractmethod
     def _take(self, step: Step) -> None:
@@ -68,6 +77,20 @@ class Incremental(ABC):
     @abstractmethod
     def values(self) -> Any:
         """Best estimate of every state so far (gtsam.Values)."""
+
+    @abstractmethod
+    def session_now(self) -> dict[str, tuple[float, float]]:
+        """Present value and sigma of each scalar of the free session states, by name; NaN for a sigma not at hand."""
+
+    def recent(self) -> tuple[NDArray[np.int64], Floats]:
+        """Stamps (m,) and present positions (m, 3) of the keyframes of the last `lag_s`, in time order."""
+        found = []
+        for step in reversed(self.steps):
+            if step.t_s < self.steps[-1].t_s - self.config.lag_s:
+                break
+            found.append((step.t_ns, self._state(step).nav.position()))
+        t_ns, position = zip(*reversed(found), strict=True)
+        return np.array(t_ns, dtype=np.int64), np.array(position)
 
     def update(self, step: Step) -> None:
         """Take one step.
@@ -117,3 +140,9 @@ class Incremental(ABC):
             session=session_values(steps, values, marginals),
             marginals=marginals,
         )
+
+
+def scalars(state: SessionState, value: Floats, sigma: Floats) -> dict[str, tuple[float, float]]:
+    """Value and sigma of each scalar of a session state; a number behind the name of those of a vector."""
+    names = [state.name] if len(value) == 1 else [f"{state.name}_{i}" for i in range(len(value))]
+    return {name: (float(v), float(s)) for name, v, s in zip(names, value, sigma, strict=True)}

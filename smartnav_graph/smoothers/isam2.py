@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, State, Step, key
-from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
+from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, SessionState, State, Step, key
+from smartnav_graph.smoothers.incremental import Effort, Incremental, ReplayConfig, scalars
 from smartnav_graph.smoothers.whole_graph import custom_factor, session_prior
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,7 @@ class Isam2(Incremental):
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         super().__init__(config, t0_ns)
         self._engine = gtsam.ISAM2(isam2_params(config.relinearize))
-        self._session: set[int] = set()
+        self._session: dict[int, SessionState] = {}
 
     def _take(self, step: Step) -> None:
         if self.config.hold:
@@ -55,8 +55,9 @@ class Isam2(Incremental):
             if name not in self._session:
                 values.insert(name, state.initial)
                 graph.push_back(session_prior(state))
-        self._session |= set(step.session)
-        self._engine.update(graph, values)
+        self._session |= step.session
+        done = self._engine.update(graph, values)
+        self.effort = Effort(done.getVariablesReeliminated(), done.getVariablesRelinearized())
 
     def _state(self, step: Step) -> State:
         i, engine = step.index, self._engine
@@ -69,6 +70,14 @@ class Isam2(Incremental):
         return np.asarray(
             block_diag(*(self._engine.marginalCovariance(key(letter, step.index)) for letter in KEYFRAME_LETTERS))
         )
+
+    def session_now(self) -> dict[str, tuple[float, float]]:
+        """Present value of each scalar of the free session states; a sigma would take longer than an update."""
+        found: dict[str, tuple[float, float]] = {}
+        for name, state in self._session.items():
+            value = self._engine.calculateEstimateVector(name)
+            found |= scalars(state, value, np.full(len(value), np.nan))
+        return found
 
     def values(self) -> Any:
         """Best estimate of every state so far (gtsam.Values)."""

@@ -69,7 +69,8 @@ def replayed(steps, watch=lambda smoother: None, **options):
 
 def test_a_lag_longer_than_the_recording_is_batch(steps, batch):
     """All states, clock offset and lever arm too, and every covariance."""
-    estimate = replayed(steps, lag_s=1e3, relinearize=1e-9).estimate()
+    smoother = replayed(steps, lag_s=1e3, relinearize=1e-9)
+    estimate, now = smoother.estimate(), smoother.session_now()
     metres, degrees = largest_difference(estimate, batch)
     assert metres < 1e-5 and np.radians(degrees) < 1e-5
     assert np.abs(estimate.states()[2] - batch.states()[2]).max() < 1e-5  # m/s
@@ -78,6 +79,9 @@ def test_a_lag_longer_than_the_recording_is_batch(steps, batch):
         assert not state.held
         np.testing.assert_allclose(state.value, batch.session[name].value, atol=1e-5)
         np.testing.assert_allclose(state.covariance, batch.session[name].covariance, rtol=1e-3)
+        scalars = [name] if len(state.value) == 1 else [f"{name}_{i}" for i in range(3)]
+        np.testing.assert_allclose([now[s][0] for s in scalars], state.value, atol=1e-9)
+        np.testing.assert_allclose([now[s][1] for s in scalars], batch.session[name].sigma, rtol=1e-3)
     np.testing.assert_allclose(estimate.covariance, batch.covariance, rtol=1e-3, atol=1e-9)
 
 

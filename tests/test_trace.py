@@ -1,0 +1,125 @@
+"""What a run remembers of itself agrees with its solution and its summary."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+
+import gtsam
+import numpy as np
+import pytest
+from exact import record
+
+from smartnav_graph import estimate, trace
+from smartnav_graph.config import Config
+from smartnav_graph.graph import STATES, Block, Step, Tag, key
+from smartnav_graph.losses import robust
+from smartnav_graph.simulation import motions
+from smartnav_graph.smoothers.incremental import ReplayConfig
+from smartnav_graph.timebase import NS
+
+
+@pytest.fixture(scope="module")
+def session():
+    """Forty seconds of walking figure eights with fixes, whose clock is a state."""
+    return record(motions.figure_eight(40.0), seed=4, fix_sigma=0.05).session.replace(control=None)
+
+
+@pytest.fixture(scope="module")
+def replayed(session):
+    return estimate.replay(session, Config(replay=ReplayConfig(lag_s=5.0, polish=False)))
+
+
+def test_wiring_has_every_factor_in_use_with_the_states_it_touches(session):
+    run = estimate.smooth(session, Config())
+    wiring = run.trace.wiring
+    assert Counter(wiring.sensor.tolist()) == run.summary["factors"]
+    assert set(wiring.letter) <= set(STATES)
+    imu = np.flatnonzero(wiring.sensor == "imu")
+    for place, factor in ((1, imu[0]), (7, imu[6])):
+        touched = wiring.factor == factor
+        got = sorted(zip(wiring.letter[touched].tolist(), wiring.index[touched].tolist(), strict=True))
+        assert set(got) >= {(letter, i) for letter in "XV" for i in (place - 1, place)}
+    assert run.trace.updates is None and run.trace.pairs is None
+    np.testing.assert_array_equal(run.trace.keyframe_ns, run.solution.t_ns)
+
+
+def test_updates_are_one_a_keyframe_and_end_at_the_causal_states(replayed):
+    updates, causal = replayed.trace.updates, replayed.causal
+    np.testing.assert_array_equal(updates.t_ns, causal.t_ns)
+    last = updates.edge[1:] - 1  # the newest keyframe of each window is the causal estimate itself
+    np.testing.assert_array_equal(updates.past_ns[last], causal.t_ns)
+    np.testing.assert_allclose(updates.past[last], causal.nav_t_body, atol=1e-12)
+
+
+def test_windows_are_as_long_as_the_lag_and_what_they_tell_last_is_the_solution(replayed):
+    updates = replayed.trace.updates
+    length = (updates.past_ns[updates.edge[1:] - 1] - updates.past_ns[updates.edge[:-1]]) / NS
+    assert length.max() <= 5.0 + 1e-9
+    assert length[-1] > 4.0
+    final = slice(updates.edge[-2], updates.edge[-1])
+    rows = np.isin(replayed.solution.t_ns, updates.past_ns[final])
+    np.testing.assert_allclose(replayed.solution.nav_t_body[rows], updates.past[final], atol=1e-9)
+
+
+def test_correction_is_the_largest_move_of_what_two_windows_share(replayed):
+    updates = replayed.trace.updates
+    k = 20
+    before, now = (
+        dict(zip(updates.past_ns[a:b].tolist(), updates.past[a:b], strict=True))
+        for a, b in zip(updates.edge[k - 1 : k + 1], updates.edge[k : k + 2], strict=True)
+    )
+    moves = [np.linalg.norm(now[t] - before[t]) for t in now.keys() & before.keys()]
+    assert updates.corrected[k] == pytest.approx(max(moves))
+    assert updates.corrected[k] > 0
+
+
+def test_clock_offset_is_followed_from_its_prior_to_what_is_found(replayed):
+    found = replayed.trace.updates.states["gnss_time_offset_s"]
+    stated = replayed.summary["states"]["gnss_time_offset_s"]
+    assert found[-1, 0] == pytest.approx(stated["value"], abs=1e-6)
+    # two ways to the covariance: the window's tail, and the recursion over the graph of all keyframes
+    assert found[-1, 1] == pytest.approx(stated["sigma"], rel=0.2)
+    assert np.nanmax(found[:, 1]) == pytest.approx(0.2, rel=0.01)  # the prior's
+    assert found[-1, 1] < 0.05
+
+
+def test_isam2_tells_its_effort_and_a_window_too(session):
+    config = Config(replay=ReplayConfig(smoother="isam2", lag_s=5.0, polish=False))
+    updates = estimate.replay(session, config).trace.updates
+    assert updates.solved[5:].min() > 0
+    assert updates.states == {}  # held there
+    assert np.diff(updates.edge).max() < 40
+
+
+def test_rows_that_are_let_go_of_are_counted():
+    unit = gtsam.noiseModel.Unit.Create(3)
+
+    def fix(model):
+        return Tag("gnss", 0, 0), gtsam.GPSFactor(key("X", 0), np.zeros(3), model)
+
+    def block(loss, used):
+        return Block("gnss", None, [(key("X", 0),)] * len(used), np.zeros((len(used), 9)), 0, used=used, loss=loss)
+
+    step = Step(0, 0, 0.0)
+    step.factors = [fix(unit), fix(robust(unit, "cauchy")), fix(robust(unit, "huber"))]
+    step.blocks = [block("cauchy", (True,)), block("none", (True, False)), block("huber", (True,))]
+    assert trace.doubted_rows(step) == 3
+
+
+def test_stamps_lie_in_the_window_that_ends_at_their_keyframe():
+    keyframes = np.array([10, 20, 30])
+    assert trace.window_of(np.array([0, 10, 11, 20, 29, 31]), keyframes).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_no_update_is_told_that_was_not_taken_in_whole():
+    log, step = trace.UpdateLog(), Step(0, 5, 0.0)
+    smoother = SimpleNamespace(
+        recent=lambda: (np.array([5]), np.zeros((1, 3))), effort=SimpleNamespace(solved=3, relinearised=0)
+    )
+    smoother.session_now = dict
+    log.take(step, smoother, 0.001)
+    smoother.session_now = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        log.take(step, smoother, 0.001)
+    assert len(log.updates().t_ns) == 1
