@@ -221,8 +221,13 @@ def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
 
 def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
     """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents."""
-    tail = (net.at(i) for i in range(net.size() - len(names), net.size()))
-    return _Joint.empty().conditioned(_slices(names), {conditional.keys()[0]: conditional for conditional in tail})[0]
+    conditionals, missing, place = {}, set(names), net.size()
+    while missing:  # one that nothing connects with the rest may stand before it
+        place -= 1
+        conditional = net.at(place)
+        conditionals[conditional.keys()[0]] = conditional
+        missing.discard(conditional.keys()[0])
+    return _Joint.empty().conditioned(_slices(names), conditionals)[0]
 
 
 def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, Any]) -> dict[int, int]:
