@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.factors.camera import BORESIGHT, STREAM, Motion
 from smartnav_graph.factors.coplanar_rows import COLUMNS, Relative, relative
 from smartnav_graph.factors.coplanarity import (
     COMPRESSED,
@@ -51,8 +52,8 @@ def settled(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> 
 
 def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> Memory:
     passed, scale = memory.settled.get(builder.name, 0), memory.scale(builder.name)
-    bias = estimate.states()[3][_keyframes(builder, estimate)[0], 3:]
-    builder.rate[:] = builder.rates(builder.image_ns, estimate.offset_s("images")) - bias
+    R, _, v, bias = (x[_keyframes(builder, estimate)[0]] for x in estimate.states())
+    builder.look(estimate.offset_s(STREAM), Motion(R, v, bias[:, 3:]))
     there, inside = relative_poses(builder, estimate)
     if passed == 0:
         use, verdict = builder.by_turn(builder.pairs, there.R)
@@ -95,7 +96,8 @@ def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tu
     sigma: that of their median, the freedom of each pair's pose taken out."""
     pairs = builder.pairs
     x0, x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
-    white = np.abs(sampson(there.R, there.t, x0, x1).residual) / builder.sigma
+    shift = None if pairs.shift is None else np.asarray(pairs.padded(pairs.shift))
+    white = np.abs(sampson(there.R, there.t, x0, x1, shift=shift).residual) / builder.sigma
     geometry = Geometry.of(pairs, there.R)
     use = (white < GATE * scale) & pairs.there
     use &= geometry.plausible(there.t, np.full(len(pairs), builder.sigma * scale), use)
@@ -155,9 +157,9 @@ def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Rel
     data[:, 1:4], data[:, 4:7] = builder.rate[first], builder.rate[second]
     states = [pose[first], pose[second]]
     if builder.rig.timed:
-        states += [v[first], v[second], np.full((len(first), 1), estimate.offset_s("images"))]
+        states += [v[first], v[second], np.full((len(first), 1), estimate.offset_s(STREAM))]
     if builder.rig.boresight:
-        states.append(np.tile(estimate.session_value("camera_boresight_rad", 3), (len(first), 1)))
+        states.append(np.tile(estimate.session_value(BORESIGHT, 3), (len(first), 1)))
     return relative(builder.rig, states, data), known[first] & known[second]
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from smartnav_graph.factors.observation import exp, right_jacobian, skew, turned
 from smartnav_graph.graph import Measured
 from smartnav_graph.losses import loss_weights
-from smartnav_graph.vision.epipolar import essential, rays, sampson
+from smartnav_graph.vision.epipolar import Sampson, cross, essential, rays, sampson
 from smartnav_graph.vision.pairs import Pairs
 
 Floats = NDArray[np.float64]
@@ -150,12 +150,25 @@ class Matched:
         self.rig, self.sigma, self.use, self.reach, self.there = rig, sigma, use, reach, pairs.there
         self.letters = rig.letters
         self.x0, self.x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
+        self.shift = None if pairs.shift is None else np.asarray(pairs.padded(pairs.shift))
+
+    def see(self, rows: NDArray[np.intp], pairs: Pairs) -> None:
+        """Put other coordinates in place of those of pairs (m,), which are `pairs` now."""
+        width = pairs.there.shape[1]
+        self.x0[rows, :width], self.x1[rows, :width] = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
+        if pairs.shift is not None:
+            self.shift = np.zeros((*self.there.shape, 3)) if self.shift is None else self.shift
+            self.shift[rows, :width] = np.asarray(pairs.padded(pairs.shift))
+
+    def missed(self, there: Relative, rows: NDArray[np.intp]) -> Sampson:
+        """How far all matches of rows (m,) of pairs miss."""
+        shift = None if self.shift is None else self.shift[rows]
+        return sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M, shift)
 
     def measured(self, states: Sequence[Floats], data: Floats) -> Measured:
         """The matches of the rows one by one; see `whole_graph.Stack.measured`."""
         rows = data[:, 0].astype(np.intp)
-        relative_pose = relative(self.rig, states, data)
-        found = sampson(relative_pose.R, relative_pose.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M)
+        found = self.missed(relative(self.rig, states, data), rows)
         white = (found.residual / self.sigma)[self.there[rows]]
         weight = loss_weights(white**2, "cauchy", self.reach)[0]
         return Measured(np.nonzero(self.there[rows])[0], white[:, None], weight, self.use[rows][self.there[rows]])
@@ -168,7 +181,7 @@ class PairRows(Matched):
         """See `graph.RowModel`."""
         rows = data[:, 0].astype(np.intp)
         there = relative(self.rig, states, data)
-        found = sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M)
+        found = self.missed(there, rows)
         white = found.residual / self.sigma
         weight, cost = loss_weights(white**2, "cauchy", self.reach)
         weight, cost = weight * self.use[rows], cost * self.use[rows]
@@ -199,7 +212,8 @@ class CompressedRows(Matched):
 
     s_0 of each match and its weight w under the loss are frozen where it was compressed; the common length of E is not:
     N = sum N_i / sum s_0i^2 with s_i^2 = vec(E)^T N_i vec(E). Exact but for the change of the weights relative to each
-    other.
+    other. Where the matches have shifts d of their own in the baseline, the constant x0~^T [d]x R x1~ of each, R where
+    it was compressed, is a tenth column beside vec(E).
     """
 
     def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float, frozen: Relative) -> None:
@@ -208,9 +222,12 @@ class CompressedRows(Matched):
         E = essential(frozen.R, frozen.t)
         l0, l1 = b @ E.transpose(0, 2, 1), a @ E
         square = (l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + BASELINE_FLOOR_M**2
-        white = ((a * l0).sum(axis=-1) ** 2 / square) / sigma**2
-        weight = use * loss_weights(white, "cauchy", reach)[0]
-        k = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:2], 9) * np.sqrt(weight / square)[..., None]
+        k, missed = (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:2], 9), (a * l0).sum(axis=-1)
+        if self.shift is not None:
+            constant = (self.shift * cross(b @ frozen.R.transpose(0, 2, 1), a)).sum(axis=-1)
+            k, missed = np.concatenate([k, constant[..., None]], axis=-1), missed + constant
+        weight = use * loss_weights(missed**2 / square / sigma**2, "cauchy", reach)[0]
+        k = k * np.sqrt(weight / square)[..., None]
         values, vectors = np.linalg.eigh(k.transpose(0, 2, 1) @ k)
         self.root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
         total = np.maximum((square * weight).sum(axis=1), 1e-300)
@@ -226,8 +243,9 @@ class CompressedRows(Matched):
         Ne = turned(N, e)
         square = (e * Ne).sum(axis=1) + self.floor[rows]  # nothing where no match is in use
         s = np.sqrt(np.where(square > 0, square, 1.0))[:, None]
-        r = turned(root, e) / (self.sigma * s)
-        by = root / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
+        at_e, constant = root[:, :, :9], root[:, :, 9:].sum(axis=2)
+        r = (turned(at_e, e) + constant) / (self.sigma * s)
+        by = at_e / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
         return r, [by @ by_e @ jacobian for jacobian in there.by]
 
 

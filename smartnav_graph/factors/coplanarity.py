@@ -11,22 +11,19 @@ factor in a graph after Indelman, Roberts, Beall, Dellaert (2012), Incremental l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.camera import BodyRates, Eye, Motion, eye_of, seen_from
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
-from smartnav_graph.factors.gnss import clock_state
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.graph import Block, Memory, RowModel, SessionState, State, Step, Window, key
+from smartnav_graph.factors.observation import exp, turned
+from smartnav_graph.graph import Block, Memory, RowModel, State, Step, Window, key
 from smartnav_graph.session import Session
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, seconds_since
+from smartnav_graph.timebase import NS
 from smartnav_graph.vision.gating import gate
 from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
 
@@ -39,12 +36,8 @@ TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
 LEAST_SHARE = 0.5
 # Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, again and compressed.
 COMPRESSED = 3
-# A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
-AROUND_S = 0.005
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
-# Stands in where no camera is calibrated: a phone's at 640 x 480.
-UNKNOWN_CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 
 @dataclass(frozen=True)
@@ -52,7 +45,8 @@ class CoplanarityConfig:
     """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
     least_parallax (rad, median once the turn is taken out) : of a pair; reach : of the Cauchy loss of a match, sigmas;
     compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's
-    attitude in the body and of its clock as states (zero: known; none given: as sure as the calibration says)."""
+    attitude in the body and of its clock as states (zero: known; none given: as sure as the calibration says);
+    row_time : points are taken as seen when the row they lie in was read, where the camera's readout is known."""
 
     enabled: bool = True
     rate_hz: float = 4.0
@@ -63,6 +57,7 @@ class CoplanarityConfig:
     compress: bool = True
     boresight_sigma_deg: float | None = None
     time_offset_sigma: float | None = None
+    row_time: bool = True
 
     def __post_init__(self) -> None:
         if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1 and self.least_matches >= POSE_DOF):
@@ -88,25 +83,24 @@ IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
 class CoplanarityBuilder:
     """Adds the pairs that end at a keyframe.
 
+    seen : pairs as they were matched; pairs : as they were in the first row of each image, by the motion found
     image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; rate (k, 3) rad/s : of the body
-    from there to the offset found; gyro : the inertial data
-    sigma : of a match, normalised; boresight_sigma rad, clock_sigma s : of the states of the camera
+    from there to the offset found; motion : of the body at the images; eye : the camera; sigma : of a match, normalised
     verdict (n,) : what became of each pair, places in `REASONS`; at_once (n,) : the same as a replay judged
     refused : why none is used, in words; frozen : relative poses of the pairs where their inliers were settled
     """
 
-    pairs: Pairs
+    seen: Pairs
     image_ns: NDArray[np.int64]
-    gyro: Imu
-    rig: Rig
+    rates: BodyRates
+    eye: Eye
     sigma: float
-    boresight_sigma: float
-    clock_sigma: float
     merge_ns: int
     config: CoplanarityConfig = field(default_factory=CoplanarityConfig)
     note: str = ""
     name: str = "coplanarity"
     stage: int = 1
+    pairs: Pairs = field(init=False)
     verdict: NDArray[np.intp] = field(init=False)
     at_once: NDArray[np.intp] = field(init=False)
     rate: Floats = field(init=False)
@@ -118,8 +112,14 @@ class CoplanarityBuilder:
     _made: tuple[tuple[object, ...], RowModel] | None = None
 
     def __post_init__(self) -> None:
+        self.pairs = self.seen
         self.verdict, self.at_once = (np.full(len(self.pairs), OUTSIDE, dtype=np.intp) for _ in range(2))
-        self.rate = np.zeros((len(self.image_ns), 3))
+        self.rate, self.motion = np.zeros((len(self.image_ns), 3)), Motion.unknown(len(self.image_ns))
+
+    @property
+    def rig(self) -> Rig:
+        """The camera in the body."""
+        return self.eye.rig
 
     # --- one window ---
 
@@ -134,7 +134,7 @@ class CoplanarityBuilder:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
         if memory.phase == "causal" and previous is not None:
-            self.rate[image] = self.rates(self.image_ns[image : image + 1], 0.0)[0] - previous.bias.gyroscope()
+            self._look_now(image, step, previous)
         ending = self._ending(image)
         if memory.phase == "causal" and len(ending):
             self._judge_now(self._model(memory), ending)
@@ -161,7 +161,7 @@ class CoplanarityBuilder:
         if not len(ending):
             return
         model, used = self._model(memory), tuple((verdict[ending] == IN_USE).tolist())
-        states = {state.letter: state for state in self._states()}
+        states = self.eye.states()
         keys, data = [], np.empty((len(ending), COLUMNS))
         for row, pair in enumerate(ending):
             images = [int(i) for i in self.pairs.images[pair]]
@@ -191,16 +191,6 @@ class CoplanarityBuilder:
         found = near < len(self.image_ns) and abs(int(self.image_ns[near]) - t_ns) <= self.merge_ns
         return near if found else None
 
-    def _states(self) -> list[SessionState]:
-        """Session states of the camera."""
-        sigma = np.full(3, self.boresight_sigma)
-        found = []
-        if self.rig.timed:
-            found.append(clock_state("images", self.clock_sigma))
-        if self.rig.boresight:
-            found.append(SessionState("A", "images", "camera_boresight_rad", np.zeros(3), sigma))
-        return found
-
     def _model(self, memory: Memory) -> RowModel:
         """The row model of a pass: made anew where what was learnt changed."""
         learnt = memory.rejected.get("matches"), memory.settled.get(self.name, 0), memory.scale(self.name), memory.phase
@@ -221,24 +211,38 @@ class CoplanarityBuilder:
         use = memory.used("matches", np.arange(len(self.pairs.pair)))
         return np.asarray(self.pairs.padded(use), dtype=bool)
 
-    def rates(self, t_ns: NDArray[np.int64], offset_s: float) -> Floats:
-        """Mean measured rates (m, 3) rad/s from stamps (m,) to an offset; around them where that is next to nothing."""
-        start, end = (0.0, offset_s) if abs(offset_s) > AROUND_S else (-AROUND_S, AROUND_S)
-        t = seconds_since(t_ns, int(self.gyro.t_ns[0]))
-        return np.asarray((self._turned_by(t + end) - self._turned_by(t + start)) / (end - start))
+    # --- when rows were seen ---
 
-    def _turned_by(self, t: Floats) -> Floats:
-        """Integral (m, 3) of the measured rate up to times (m,) s since the first sample."""
-        return np.stack([np.interp(t, self._seconds, column) for column in self._integral.T], axis=1)
+    def look(self, offset_s: float, motion: Motion) -> None:
+        """Take the motion found at the images, and the clock offset of the camera."""
+        self.rate[:] = self.rates.mean(self.image_ns, offset_s) - motion.gyro_bias
+        self.motion = motion
+        self.pairs = self._at_once(self.seen, offset_s)
 
-    @cached_property
-    def _seconds(self) -> Floats:
-        return seconds_since(self.gyro.t_ns, int(self.gyro.t_ns[0]))
+    def _look_now(self, image: int, step: Step, previous: State) -> None:
+        """The same at one image of a replay, by what is foretold."""
+        bias = previous.bias.gyroscope()
+        self.rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
+        self.motion.nav_R_body[image] = step.predicted.attitude().matrix()
+        self.motion.nav_v_body[image], self.motion.gyro_bias[image] = step.predicted.velocity(), bias
 
-    @cached_property
-    def _integral(self) -> Floats:
-        steps = 0.5 * (self.gyro.gyro[1:] + self.gyro.gyro[:-1]) * np.diff(self._seconds)[:, None]
-        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    def _at_once(self, pairs: Pairs, offset_s: float) -> Pairs:
+        """Pairs as they would be had all rows of an image been read at once with its first.
+
+        A ray seen d later turns with the camera, x' ~ Exp(w d) x~, and its camera has gone on by v d: pairs whose rows
+        lie at d0, d1 have a baseline of t + c0_R_nav (v1 d1 - v0 d0).
+        """
+        if self.eye.readout_s == 0:
+            return pairs
+        stamps, motion = self.image_ns + round(offset_s * NS), self.motion
+        speed = self.eye.velocity(motion, self.rate)
+        xy, way = [], []
+        for x, place in zip((pairs.x0, pairs.x1), pairs.images[pairs.pair].T, strict=True):
+            delay = self.eye.delay(x)
+            xy.append(seen_from(x, self.eye.turns(self.rates, stamps[place], delay, motion.gyro_bias[place])))
+            way.append(speed[place] * delay[:, None])
+        first = motion.nav_R_body[pairs.images[pairs.pair, 0]] @ self.rig.body_R_cam
+        return replace(pairs, x0=xy[0], x1=xy[1], shift=turned(first.transpose(0, 2, 1), way[1] - way[0]))
 
     # --- which matches ---
 
@@ -253,7 +257,9 @@ class CoplanarityBuilder:
         assert isinstance(model, PairRows)
         C = self.rig.body_R_cam
         turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.pairs.images[ending]]
-        some = self.pairs.of(ending)
+        some = self._at_once(self.seen.of(ending), 0.0)
+        if some.shift is not None:
+            model.see(ending, some)
         use, self.at_once[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
         model.use[ending, : use.shape[1]] = use
 
@@ -283,27 +289,16 @@ def pairs_of(session: Session, config: CoplanarityConfig) -> Pairs | None:
 
 def build(context: FactorContext) -> CoplanarityBuilder | None:
     """The builder of a session's image pairs."""
-    pairs, config, camera = context.pairs, context.config.coplanarity, context.camera
+    pairs, config = context.pairs, context.config.coplanarity
     if pairs is None or not len(pairs):
         return None
-    mount = context.session.mount(context.camera_name)
-    degrees, seconds = config.boresight_sigma_deg, config.time_offset_sigma
-    degrees = (camera or UNKNOWN_CAMERA).boresight_sigma_deg if degrees is None else degrees
-    seconds = (camera or UNKNOWN_CAMERA).time_offset_sigma_s if seconds is None else seconds
-    rig = Rig(
-        np.array(mount.body_R, dtype=np.float64),
-        np.array(mount.body_t, dtype=np.float64),
-        boresight=degrees > 0,
-        timed=seconds > 0,
-    )
+    eye = eye_of(context, config)
     return CoplanarityBuilder(
         pairs,
         context.image_ns,
-        context.session.require_imu(),
-        rig,
-        sigma=(camera or UNKNOWN_CAMERA).noise,
-        boresight_sigma=float(np.radians(degrees)),
-        clock_sigma=seconds,
+        BodyRates(context.session.require_imu()),
+        eye,
+        sigma=eye.camera.noise,
         merge_ns=round(context.config.keyframes.merge_s * NS),
         config=config,
     )

@@ -41,7 +41,7 @@ def essential(R: Floats, t: Floats) -> Floats:
     return np.asarray(np.cross(t[..., None, :], np.swapaxes(R, -1, -2)).swapaxes(-1, -2))
 
 
-def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0) -> Sampson:
+def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0, shift: Floats | None = None) -> Sampson:
     """How far the matches of a pair, or of many pairs, miss the epipolar geometry of their cameras.
 
     Parameters
@@ -49,8 +49,10 @@ def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0) ->
     R : (..., 3, 3) c0_R_c1; t : (..., 3) c0_t_c1, of which only the direction matters without a floor
     x0, x1 : (..., m, 2) undistorted normalised coordinates
     floor : length in units of t, below which a baseline says little
+    shift : (..., m, 3) what the baseline of each match has beyond t, a constant
     """
     a, b, t, back = rays(x0), rays(x1), t[..., None, :], R
+    t = t if shift is None else t + shift
     R = np.swapaxes(R, -1, -2)  # x @ R turns rows
     y = b @ R
     l0 = cross(t, y)

@@ -25,6 +25,8 @@ class Pairs:
 
     t_ns (k,) : stamps of the images, in time order; images (n, 2) : places of the first and second image of each pair
     x0, x1 (m, 2) : undistorted normalised coordinates; pair (m,) : of each match, ascending
+    shift (m, 3) : what the baseline of each match has beyond that of its pair, m in the axes of the first camera: their
+    rows were not seen at the time of the image
     """
 
     t_ns: NDArray[np.int64]
@@ -32,6 +34,7 @@ class Pairs:
     x0: Floats
     x1: Floats
     pair: Ints
+    shift: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -62,7 +65,8 @@ class Pairs:
         """Some of the pairs, in ascending order."""
         chosen = np.isin(self.pair, rows)
         pair = np.searchsorted(rows, self.pair[chosen])
-        return Pairs(self.t_ns, self.images[rows], self.x0[chosen], self.x1[chosen], pair)
+        shift = None if self.shift is None else self.shift[chosen]
+        return Pairs(self.t_ns, self.images[rows], self.x0[chosen], self.x1[chosen], pair, shift)
 
     def padded(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
         """One value or row a match (m, ...) as (n, k, ...); zero in empty places."""

@@ -134,6 +134,42 @@ def test_compressed_pairs_have_the_same_minimum_and_curvature(rng):
         np.testing.assert_allclose(cost[1], cost[0], rtol=0.05, atol=0.5)
 
 
+def shifted(pairs, states, data, rng, size=0.03):
+    """The pairs with every second image seen from elsewhere by so much a match, and told so."""
+    R, t, _ = relative(RIG, states, data)
+    shift = rng.normal(0, size, (len(pairs.pair), 3))
+    near = rng.uniform([-2, -2, 3], [2, 2, 8], (len(pairs.pair), 3))
+    far = (R[pairs.pair] @ near[..., None])[..., 0] + t[pairs.pair] + shift
+    x0, x1 = far[:, :2] / far[:, 2:], near[:, :2] / near[:, 2:]
+    return replace(pairs, x0=x0, x1=x1, shift=shift)
+
+
+def test_a_shift_belongs_to_the_baseline(rng):
+    pairs, states, data = scene(rng)
+    seen = shifted(pairs, states, data, rng)
+    there = relative(RIG, states, data)
+    full = PairRows(seen, RIG, SIGMA, seen.there, 2.0)
+    small = CompressedRows(seen, RIG, SIGMA, seen.there, 1e6, there)
+    assert np.abs(full.linearize(states, data)[0]).max() < 1e-6
+    assert np.abs(small.linearize(states, data)[0]).max() < 1e-3
+    ignored = PairRows(replace(seen, shift=None), RIG, SIGMA, seen.there, 2.0)
+    assert np.abs(ignored.linearize(states, data)[0]).max() > 3.0
+    step = 1e-3
+    for axis in range(6):
+        moved_on = [states[0], moved("X", states[1], axis, step)]
+        cost = [(rows.linearize(moved_on, data)[0] ** 2).sum(axis=1) for rows in (full, small)]
+        np.testing.assert_allclose(cost[1], cost[0], rtol=0.3, atol=0.5)  # each match has its own length
+
+
+def test_a_pair_seen_anew_replaces_the_old_one(rng):
+    pairs, states, data = scene(rng)
+    seen = shifted(pairs, states, data, rng)
+    rows = PairRows(pairs, RIG, SIGMA, pairs.there, 2.0)
+    rows.see(np.array([1]), seen.of(np.array([1])))
+    residual = rows.linearize(states, data)[0]
+    assert np.abs(residual).max() < 1e-6 and rows.shift[0].any() == 0 and rows.shift[1].any()
+
+
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("kind", ["pairs", "compressed"])
 def test_rows_fall_with_their_derivatives(rng, rig, kind):

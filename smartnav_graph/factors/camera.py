@@ -1,0 +1,157 @@
+"""What builders that look through a camera share: where it sits, when it looks, and how the body moves meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.coplanar_rows import Rig
+from smartnav_graph.factors.gnss import clock_state
+from smartnav_graph.factors.observation import exp, turned
+from smartnav_graph.graph import SessionState
+from smartnav_graph.streams import Imu
+from smartnav_graph.timebase import NS, seconds_since
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+# States of the camera belong to this stream; the name of its correction in the body.
+STREAM = "images"
+BORESIGHT = "camera_boresight_rad"
+# A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
+AROUND_S = 0.005
+# Stands in where no camera is calibrated: a phone's at 640 x 480.
+UNKNOWN_CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+
+
+class BodyRates:
+    """Turn of the body by the gyroscope as it was read, its bias included."""
+
+    def __init__(self, imu: Imu) -> None:
+        self._imu = imu
+
+    def mean(self, t_ns: Times, offset_s: float) -> Floats:
+        """Mean rates (m, 3) rad/s from stamps (m,) to an offset; around them where that is next to nothing."""
+        start, end = (0.0, offset_s) if abs(offset_s) > AROUND_S else (-AROUND_S, AROUND_S)
+        t = self._since(t_ns)
+        return np.asarray((self._turned_by(t + end) - self._turned_by(t + start)) / (end - start))
+
+    def turn(self, t_ns: Times, length_s: Floats) -> Floats:
+        """Integral (m, 3) rad of the rate over `length_s` (m,) s from stamps (m,) on."""
+        t = self._since(t_ns)
+        return self._turned_by(t + length_s) - self._turned_by(t)
+
+    def _since(self, t_ns: Times) -> Floats:
+        return seconds_since(t_ns, int(self._imu.t_ns[0]))
+
+    def _turned_by(self, t: Floats) -> Floats:
+        """Integral (m, 3) of the rate up to times (m,) s since the first sample."""
+        return np.stack([np.interp(t, self._seconds, column) for column in self._integral.T], axis=1)
+
+    @cached_property
+    def _seconds(self) -> Floats:
+        return seconds_since(self._imu.t_ns, int(self._imu.t_ns[0]))
+
+    @cached_property
+    def _integral(self) -> Floats:
+        steps = 0.5 * (self._imu.gyro[1:] + self._imu.gyro[:-1]) * np.diff(self._seconds)[:, None]
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Of the body at k images: nav_R_body (k, 3, 3), nav_v_body (k, 3) m/s, gyro_bias (k, 3) rad/s."""
+
+    nav_R_body: Floats
+    nav_v_body: Floats
+    gyro_bias: Floats
+
+    @classmethod
+    def unknown(cls, count: int) -> Motion:
+        """At rest, until it is found."""
+        return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3)))
+
+
+@dataclass(frozen=True)
+class Eye:
+    """The camera of a session as its factors take it.
+
+    camera : its calibration, or what stands in for one; readout_s : from its first row to its last, zero where rows
+    are taken as seen at once; boresight_sigma rad, clock_sigma s : priors of its states, zero for none
+    """
+
+    camera: Camera
+    rig: Rig
+    readout_s: float
+    boresight_sigma: float
+    clock_sigma: float
+
+    def states(self) -> Mapping[str, SessionState]:
+        """Session states of the camera, by letter."""
+        found = {}
+        if self.rig.timed:
+            found["T"] = clock_state(STREAM, self.clock_sigma)
+        if self.rig.boresight:
+            found["A"] = SessionState("A", STREAM, BORESIGHT, np.zeros(3), np.full(3, self.boresight_sigma))
+        return found
+
+    def delay(self, xy_n: Floats) -> Floats:
+        """When points (m, 2) were seen, s (m,) after the first row of their image."""
+        if self.readout_s == 0:
+            return np.zeros(len(xy_n))
+        rows = self.camera.pixels(xy_n)[:, 1]
+        return np.asarray(self.readout_s * np.clip(rows / (self.camera.height - 1), 0.0, 1.0))
+
+    def turns(self, rates: BodyRates, t_ns: Times, delay: Floats, bias: Floats) -> Floats:
+        """Rotation vectors (m, 3), camera axes, of the camera from stamps (m,) to `delay` (m,) s later; `bias` (m, 3)
+        of the gyroscope."""
+        turn = rates.turn(t_ns, delay) - bias * delay[:, None]
+        return np.asarray(turn @ self.rig.body_R_cam)
+
+    def velocity(self, motion: Motion, rate: Floats) -> Floats:
+        """Of the camera (k, 3) m/s in nav axes, from that of the body and its rate (k, 3) rad/s."""
+        around = np.cross(rate, self.rig.body_t_cam)
+        return motion.nav_v_body + turned(motion.nav_R_body, around)
+
+
+def seen_from(xy_n: Floats, turn: Floats) -> Floats:
+    """Points (m, 2) that a camera saw after it had turned by rotation vectors (m, 3), as it would have seen them
+    before, had it only turned."""
+    ray = turned(exp(turn), np.column_stack([xy_n, np.ones(len(xy_n))]))
+    return np.asarray(ray[:, :2] / ray[:, 2:])
+
+
+def eye_of(context: FactorContext, config: Any) -> Eye:
+    """The camera of a session; `config` is the coplanarity's, which has the options of the camera."""
+    camera = context.camera or UNKNOWN_CAMERA
+    mount = context.session.mount(context.camera_name)
+    degrees = camera.boresight_sigma_deg if config.boresight_sigma_deg is None else config.boresight_sigma_deg
+    seconds = camera.time_offset_sigma_s if config.time_offset_sigma is None else config.time_offset_sigma
+    rig = Rig(
+        np.array(mount.body_R, dtype=np.float64),
+        np.array(mount.body_t, dtype=np.float64),
+        boresight=degrees > 0,
+        timed=seconds > 0,
+    )
+    readout = _readout_s(context) if config.row_time else 0.0
+    return Eye(camera, rig, readout, float(np.radians(degrees)), seconds)
+
+
+def _readout_s(context: FactorContext) -> float:
+    """Of the session's images as recorded, their median, else as calibrated; unknown without a calibration, which says
+    what row a point was in."""
+    if context.camera is None:
+        return 0.0
+    images = context.session.images
+    if images is not None and images.readout_ns is not None:
+        own = images.readout_ns[images.camera.astype(str) == context.camera_name]
+        if len(own):
+            return float(np.median(own)) / NS
+    return context.camera.readout_s
