@@ -57,7 +57,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 @dataclass(frozen=True)
 class Run:
     """Everything one run gives. `summary` is what summary.json holds; `causal_windows` are those that a replay went
-    through, one a row of `causal`."""
+    through, one a row of `causal`; `estimate` is the solved graph behind `solution`."""
 
     problem: Problem
     solution: Solution
@@ -66,6 +66,7 @@ class Run:
     withheld: Mapping[str, Withheld] = field(default_factory=dict)
     causal_windows: Sequence[Window] = ()
     trace: Trace | None = None
+    estimate: Estimate | None = None
 
     @property
     def session(self) -> Session:
@@ -263,7 +264,8 @@ def _finish(
     solution = densify(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(problem, initial, estimate, memory, keyframes, withheld, clock.to_dict(), extra)
-    return Run(problem, solution, summary, causal, withheld, trace=Trace.of(problem, estimate, memory, updates))
+    trace = Trace.of(problem, estimate, memory, updates)
+    return Run(problem, solution, summary, causal, withheld, trace=trace, estimate=estimate)
 
 
 def _refuse_empty(problem: Problem, memory: Memory) -> None:

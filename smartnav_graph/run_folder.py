@@ -1,7 +1,8 @@
 """The folder a run leaves behind, and reading it back.
 
 trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
-summary.json, config.toml, calibration.toml, report.html, run.rrd: all of them, or nothing.
+keyframes.parquet, influence.parquet (the linear system at the solution, see `influence`), summary.json, config.toml,
+calibration.toml, report.html, run.rrd: all of them, or nothing.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.export import write_trajectory_csv
 from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.frames import Origin
+from smartnav_graph.influence import FACTORS, Influence
 from smartnav_graph.session import Session, write_table
 from smartnav_graph.solution import Residuals, Solution
 
@@ -158,6 +160,8 @@ def _write_tables(run: Run, folder: Path) -> None:
     rows = withheld_columns(run)
     if rows:
         write_table(rows, folder / "withheld.parquet")
+    if run.estimate is not None:
+        Influence.of(run.estimate, run.problem.windows).write(folder)
 
 
 def residual_columns(residuals: Residuals) -> dict[str, Any]:
@@ -259,6 +263,25 @@ def read_run(path: str | Path) -> StoredRun:
         summary=summary,
         causal=_read_states(causal, key) if causal.is_file() else None,
     )
+
+
+def read_influence(path: str | Path) -> Influence:
+    """The linear system that a run left in its folder.
+
+    Raises
+    ------
+    SessionError
+        The run has none, or it cannot be read.
+    """
+    try:
+        return Influence.read(Path(path))
+    except FileNotFoundError as error:
+        missing = Path(str(error.filename or "influence.parquet")).name
+        raise SessionError(
+            path, f"holds no {missing}", "a run that can be explained", "smooth the session again"
+        ) from error
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        raise _unreadable(Path(path) / FACTORS, error) from error
 
 
 def _read_states(path: Path, key: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:

@@ -16,7 +16,7 @@ ORDER = (
     *("solution", "losses", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "start", "initialise"),
     *("config", "withhold", "problem", "variance", "row_noise", "pair_gate", "revise"),
-    *("first_state", "rejections", "assemble", "summary", "trace", "estimate"),
+    *("first_state", "rejections", "assemble", "influence", "summary", "trace", "estimate"),
     *("evaluation", "intervals", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )
 DOOR = "__init__"  # it alone may look everywhere
