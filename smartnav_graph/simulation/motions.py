@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,50 +111,66 @@ def creep(rng: np.random.Generator, speed: float, rate: float) -> tuple[Sway, ..
 
 @dataclass(frozen=True)
 class Corridors:
-    """A trolley pushed along the corridors of a grid, turned on the spot where they cross, from a long rest.
+    """A trolley pushed along the corridors of a grid, from a long rest.
 
     It starts at the origin facing north, which is what a start from a rest takes for granted where nothing else is
-    told. Between two crossings it takes `drive_s` seconds, speeding up and slowing down within `ramp_s`. Each word of
-    `turns` is the way to the next stop of `stop_s`: at every letter it halts, turns by 90 deg to the left (L) or right
-    (R) within `turn_s`, halts again, each time for `halt_s`, and drives on. Nothing that people lean on is quite at
-    rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the speeds left an axis, root mean square.
+    told. Each word of `turns` is the way to the next stop of `stop_s`: a letter a crossing, with a turn of 90 deg to
+    the left (L) or right (R) within `turn_s`. The first of three crossings is taken in an arc, at `corner_m_s`; at the
+    others it halts, is turned on the spot and halts again, each time for `halt_s`. Speeds change within `ramp_s`.
+    Nothing that people lean on is quite at rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the speeds
+    left an axis, root mean square.
     """
 
     turns: tuple[str, ...] = (
-        *("LLRR", "RLLL", "RRRL", "LLLR", "RLLL"),
-        *("LRRR", "LRRR", "LRRR", "LLRL", "LLRR"),
+        *("LLRRRL", "LRLLRL", "LLRRRR", "RRLRLL", "LRRRRL"),
+        *("RLRRLR", "RLRRLR", "RLRRRL", "RLLLLR", "RRLLRL"),
     )
+    spacing_m: float = 8.016  # so that all takes 20 min
     rest_s: float = 180.0
     stop_s: float = 10.0
-    drive_s: float = 14.0
     ramp_s: float = 2.0
     turn_s: float = 3.9
     halt_s: float = 0.8
     speed_m_s: float = 1.0
+    corner_m_s: float = 0.6
     fidget_m_s: float = 4e-4
     creep_m_s: float = 1.5e-4
     creep_rad_s: float = 3.5e-5
     sway: tuple[Sway, ...] = _CASTORS
 
-    @property
-    def spacing_m(self) -> float:
-        """Metres between two crossings."""
-        return self.speed_m_s * (self.drive_s - self.ramp_s)
-
     def __call__(self, seconds: float, rng: np.random.Generator) -> Trajectory:
         """The motion; it takes as long as it takes."""
         legs = [Leg(self.rest_s, 0.0)]
-        halt = Leg(self.halt_s, 0.0)
         for word in self.turns:
-            for letter in word:
-                legs += [*self._drive(), halt, Leg(self.turn_s, 0.0, 90.0 if letter == "L" else -90.0), halt]
-            legs += [*self._drive(), Leg(self.stop_s, 0.0)]
+            legs += [*self._way(word), Leg(self.stop_s, 0.0)]
         fidget = slip(rng, self.fidget_m_s, axes=(0, 1, 2)) + creep(rng, self.creep_m_s, self.creep_rad_s)
         return Trajectory(Legs(legs), sway=self.sway, sway_speed=self.speed_m_s, fidget=fidget)
 
-    def _drive(self) -> list[Leg]:
-        v = self.speed_m_s
-        return [Leg(self.ramp_s, v), Leg(self.drive_s - 2 * self.ramp_s, v), Leg(self.ramp_s, 0.0)]
+    def _way(self, word: str) -> Iterator[Leg]:
+        """To the next stop: a corridor to each crossing, and one more."""
+        halt, speed, done = Leg(self.halt_s, 0.0), 0.0, 0.0
+        for count, letter in enumerate(word):
+            turn_deg = 90.0 if letter == "L" else -90.0
+            if count % 3 == 0:
+                yield from self._drive(self.spacing_m - done - self._arc_m, speed, self.corner_m_s)
+                yield Leg(self.turn_s, self.corner_m_s, turn_deg)
+                speed, done = self.corner_m_s, self._arc_m
+            else:
+                yield from self._drive(self.spacing_m - done, speed, 0.0)
+                yield from (halt, Leg(self.turn_s, 0.0, turn_deg), halt)
+                speed, done = 0.0, 0.0
+        yield from self._drive(self.spacing_m - done, speed, 0.0)
+
+    @property
+    def _arc_m(self) -> float:
+        """How far along the corridor, and then along the next one, an arc goes: the integral of the cosine."""
+        share = np.linspace(0.0, 1.0, 2001)
+        angle = np.pi / 2 * share**3 * (6.0 * share**2 - 15.0 * share + 10.0)
+        return float(np.trapezoid(np.cos(angle), share)) * self.corner_m_s * self.turn_s
+
+    def _drive(self, metres: float, begin: float, end: float) -> list[Leg]:
+        v, ramps = self.speed_m_s, self.ramp_s * (self.speed_m_s + (begin + end) / 2)
+        return [Leg(self.ramp_s, v), Leg((metres - ramps) / v, v), Leg(self.ramp_s, end)]
 
 
 def in_a_room(duration: float, rng: np.random.Generator) -> Trajectory:

@@ -1,12 +1,13 @@
 """The named scenarios, each a `Scenario` that a seed turns into a session with its truth; see `recording`.
 
-With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min (matches of adjacent images; its
-constants are frozen). These start at rest in the origin facing north and are told no position: a start without fixes
-takes just that for granted, in batch and replay alike, so that errors are those of the whole way. The trolley rests for
-three minutes and stops ten times for ten seconds; at corners it halts for 0.8 s before and after it is turned, too
-briefly to be found at rest, so that the listed halts hold its velocity and not its heading. Without standstills:
-``--standstill.zupt False --standstill.zaru False``. A wrong boresight or camera clock, of which the session is told
-nothing: ``replace(scenario, camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
+With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min (matches of images up to 2 s apart, as
+`smartnav match` pairs them; its constants are frozen). These start at rest in the origin facing north and are told no
+position: a start without fixes takes just that for granted, in batch and replay alike, so that errors are those of the
+whole way. The trolley rests for three minutes and stops ten times for ten seconds; at two corners of three it halts for
+0.8 s before and after it is turned, too briefly to be found at rest, so that the listed halts hold its velocity and not
+its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False --standstill.zaru
+False``. A wrong boresight or camera clock, of which the session is told nothing: ``replace(scenario,
+camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
 """
 
 from __future__ import annotations
@@ -93,11 +94,11 @@ _TROLLEY = motions.Corridors()
 _CORRIDORS = CameraModel(
     camera=PHONE_CAMERA,
     mount=_ON_PHONE,
-    scene=CorridorGrid(nodes=(4, 5), origin=(3, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
+    scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
     rate_hz=1.25,
     range_m=(0.3, 40.0),
     count=(15, 60),
-    pairs=(1,),
+    pairs=(1, 2),  # those that `smartnav match` makes of such images: up to 2 s apart
     faults=Faults(outliers=(0.1, 0.3)),
 )
 
