@@ -15,6 +15,7 @@ from smartnav_graph.cli import COMMANDS, command_class, demo, main
 from smartnav_graph.cli.options import Estimating, join_values, parse
 from smartnav_graph.run_folder import read_run
 from smartnav_graph.smoothers.incremental import Incremental
+from smartnav_graph.streams import Images
 
 START = "--initial 0,0,0,0,3,30"
 FAST = ("--to", "20", *START.split(), "--quiet")
@@ -136,6 +137,26 @@ def test_export_and_evaluation_of_the_export_is_zero(call, tmp_path):
         assert (tmp_path / f"run.{name}").stat().st_size > 1000
 
 
+def test_export_of_pictures_with_their_place(call, workshop, tmp_path):
+    from PIL import Image
+
+    eight = sn.load(workshop / "eight")
+    (tmp_path / "pictures").mkdir()
+    for i in range(3):
+        Image.new("RGB", (16, 12)).save(tmp_path / "pictures" / f"{i}.png")
+    images = Images(
+        t_ns=eight.t0_ns + np.array([1, 2, 50]) * 10**9,
+        image_id=np.arange(3),
+        file=np.array([f"{i}.png" for i in range(3)], dtype=object),
+        camera=np.array(["cam"] * 3, dtype=object),
+    )
+    sn.save(eight.replace(images=images, pictures=tmp_path / "pictures"), tmp_path / "seen")
+    line = f"export run --format images --session {tmp_path}/seen --out {tmp_path}/placed"
+    assert call(line) == (0, f"images: 2 in {tmp_path}/placed, with geotags.csv\n", "left out: 1 (outside the run)\n")
+    assert sorted(path.name for path in (tmp_path / "placed").iterdir()) == ["0.png", "1.png", "geotags.csv"]
+    assert call(line)[0] == 1 and call(f"{line} --force")[0] == 0
+
+
 def test_compare_tells_how_far_two_runs_are_apart(call):
     code, out, _ = call("compare run run --json")
     same = json.loads(out)
@@ -231,6 +252,8 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
         ("compare run nowhere", "nowhere: is no folder; expected a run folder"),
         ("export run --format tum --out eight --force", "eight: is a folder; expected the name of a file"),
         ("export run --format tum --out eight/session.toml", "eight/session.toml: exists already"),
+        ("export run --format images --out new", "eight: has no images"),
+        ("export run --format images --out new --session gone", "run: came from gone, which is not there"),
         ("view nowhere --web", "nowhere: does not exist"),
     ],
 )

@@ -11,13 +11,14 @@ from typing import Annotated, Literal
 import tyro
 
 from smartnav_graph import estimate, readers
+from smartnav_graph.calibration import model as calibration_model
 from smartnav_graph.cli.options import Estimating, Writing, given, progress, repairs
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SessionError, SmartnavError
 from smartnav_graph.evaluation import Evaluation, evaluate
-from smartnav_graph.export import export
-from smartnav_graph.run_folder import check_out, read_run, write_run
+from smartnav_graph.export import export, export_pictures
+from smartnav_graph.run_folder import StoredRun, check_out, read_run, write_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,21 +85,46 @@ def against_own_reference(run: estimate.Run) -> Evaluation | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Writing):
-    """A run as one file for other programs.
+    """A run for other programs: one file, or its pictures with their place.
+
+    images copies the pictures of the session into a folder, with position, direction, time and one sigma in their EXIF
+    and in geotags.csv; the originals are only read.
 
     Example: smartnav export kitti-run --format tum --out kitti.tum
     """
 
     run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
     """Run folder."""
-    format: Literal["tum", "kml", "geojson", "gpx", "csv"]
-    """The format; kml, geojson and gpx need an origin."""
+    format: Literal["tum", "kml", "geojson", "gpx", "csv", "images"]
+    """The format; kml, geojson, gpx and images need an origin."""
     solution: Literal["smoothed", "causal"] = "smoothed"
     """Which of a replay's two."""
+    session: Annotated[Path | None, tyro.conf.arg(metavar="SESSION")] = None
+    """For images: where the session is, if not where it was smoothed."""
 
     def run(self) -> None:
         run = read_run(self.run_path)
+        if self.format == "images":
+            self._pictures(run)
+            return
         if self.out.is_dir():  # --force is for an older export, not for a folder
             raise SessionError(self.out, "is a folder", "the name of a file", "choose another --out")
         export(run.named(self.solution), self.format, self.out, force=self.force, clock_epoch=run.clock_epoch)
         print(f"{self.format}: {self.out}")
+
+    def _pictures(self, run: StoredRun) -> None:
+        source = self.session or run.summary["session"].get("source")
+        if source is None or not Path(source).exists():
+            found = "does not say where its session is" if source is None else f"came from {source}, which is not there"
+            raise SessionError(self.run_path, found, "a session with pictures", "give --session")
+        done = export_pictures(
+            run.named(self.solution),
+            readers.load(source),
+            self.out,
+            calibration=calibration_model.load(self.run_path / "calibration.toml"),
+            states=run.summary.get("states"),
+            force=self.force,
+        )
+        print(f"images: {done.written} in {self.out}, with geotags.csv")
+        for reason, n in done.left_out.items():
+            print(f"left out: {n} ({reason})", file=sys.stderr)

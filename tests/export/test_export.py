@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph import frames
 from smartnav_graph.errors import SessionError
-from smartnav_graph.export import FORMATS, GPX_NAMESPACE, export, write_trajectory_csv
+from smartnav_graph.export import FORMATS, export, write_trajectory_csv
+from smartnav_graph.export.geographic import GPX_NAMESPACE, MARKS, OWN_NAMESPACE
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.solution import Solution
 
@@ -114,7 +116,7 @@ def test_kml_track_with_time_and_sigma(solution, lla, tmp_path):
     assert when[0] == UTC0 and len(when) == len(solution)
     arrays = {node.get("name"): node for node in tree.iterfind(".//gx:SimpleArrayData", KML)}
     assert [float(v.text) for v in arrays["sigma_n_m"].iterfind("gx:value", KML)] == pytest.approx([0.4] * 40)
-    description = tree.findtext(".//k:Placemark/k:description", namespaces=KML)
+    description = tree.findtext(".//k:Document/k:description", namespaces=KML)
     assert "one sigma horizontal: median 0.500 m" in description and "vertical: median 2.000 m" in description
     assert tree.findtext(".//gx:Track/k:altitudeMode", namespaces=KML) == "absolute"
 
@@ -125,7 +127,7 @@ def test_kml_without_absolute_time_is_a_line_that_says_so(solution, lla, tmp_pat
     text = tree.findtext(".//k:LineString/k:coordinates", namespaces=KML).split()
     assert np.array_equal(np.array([[float(x) for x in c.split(",")] for c in text])[:, [1, 0, 2]], lla)
     assert tree.find(".//k:when", KML) is None
-    assert "no absolute time" in tree.findtext(".//k:Placemark/k:description", namespaces=KML)
+    assert "no absolute time" in tree.findtext(".//k:Document/k:description", namespaces=KML)
 
 
 def test_gpx_reads_back(solution, lla, tmp_path):
@@ -153,25 +155,107 @@ def test_gpx_without_absolute_time(solution, tmp_path):
     assert "<time>" not in text and "no absolute time" in text
 
 
-def test_geojson_reads_back(solution, lla, tmp_path):
+def test_gpx_is_valid_and_carries_sigmas(solution, tmp_path):
+    validate = pytest.importorskip("gpx.validation").validate
+    for epoch in ("unix", "boot"):
+        export(solution, "gpx", tmp_path / "a.gpx", clock_epoch=epoch, force=True)
+        assert [str(issue) for issue in validate(tmp_path / "a.gpx").issues] == []
+    sigma = etree.parse(str(tmp_path / "a.gpx")).iterfind(f".//{{{OWN_NAMESPACE}}}sigma_n_m")
+    assert [float(node.text) for node in sigma] == [0.4] * 40
+    broken = (tmp_path / "a.gpx").read_text().replace("<ele>", "<height>").replace("</ele>", "</height>")
+    (tmp_path / "b.gpx").write_text(broken)
+    assert not validate(tmp_path / "b.gpx").is_valid  # the schema does see a fault
+
+
+def kml_schema() -> etree.XMLSchema:
+    """KML 2.2 with Google's extensions."""
+    fastkml = pytest.importorskip("fastkml")
+    return etree.XMLSchema(etree.parse(str(Path(fastkml.__file__).parent / "schema" / "kml22gx.xsd")))
+
+
+@pytest.mark.parametrize("epoch", ["unix", "boot"])
+def test_kml_keeps_to_its_schema(solution, epoch, tmp_path):
+    schema = kml_schema()
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch=epoch)
+    tree = etree.parse(str(tmp_path / "a.kml"))
+    schema.assertValid(tree)
+    for node in tree.iter(f"{{{KML['k']}}}name"):
+        node.tag = f"{{{KML['k']}}}label"
+    assert not schema.validate(tree)  # the schema does see a fault
+
+
+def test_kml_tells_epochs_one_by_one(tmp_path):
+    solution = make_solution(1000)
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch="unix")
+    tree = etree.parse(str(tmp_path / "a.kml"))
+    points = tree.findall(".//k:Folder/k:Placemark", KML)
+    assert len(points) == MARKS
+    last = {node.get("name"): float(node.findtext("k:value", namespaces=KML)) for node in points[-1].iter("{*}Data")}
+    assert last["elapsed_s"] == pytest.approx(solution.seconds[-1], abs=1e-3)
+    assert (last["sigma_e_m"], last["sigma_n_m"], last["sigma_u_m"]) == (0.3, 0.4, 2.0)
+    assert last["heading_deg"] == pytest.approx(solution.heading_pitch_roll_deg[-1, 0], rel=1e-5)
+    assert points[0].findtext("k:TimeStamp/k:when", namespaces=KML) == UTC0
+
+
+@pytest.fixture
+def fiona():
+    """OGR, which QGIS reads with."""
+    module = pytest.importorskip("fiona")
+    module.drvsupport.supported_drivers["KML"] = "r"
+    return module
+
+
+def test_kml_line_is_read_by_ogr(solution, lla, fiona, tmp_path):
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch="boot")
+    (layer,) = [name for name in fiona.listlayers(tmp_path / "a.kml") if name != "epochs"]
+    with fiona.open(tmp_path / "a.kml", layer=layer) as rows:
+        assert rows.driver == "KML"
+        (row,) = rows
+    assert np.array_equal(np.array(row.geometry["coordinates"])[:, [1, 0, 2]], lla)
+
+
+def test_kml_track_has_its_epochs_in_ogr(solution, lla, fiona, tmp_path):
+    export(solution, "kml", tmp_path / "a.kml", clock_epoch="unix")
+    with fiona.open(tmp_path / "a.kml", layer="epochs") as rows:
+        assert np.array_equal(np.array([r.geometry["coordinates"] for r in rows])[:, [1, 0, 2]], lla)
+
+
+def test_gpx_is_read_by_ogr(solution, lla, fiona, tmp_path):
+    export(solution, "gpx", tmp_path / "a.gpx", clock_epoch="unix")
+    with fiona.open(tmp_path / "a.gpx", layer="tracks") as rows:
+        (row,) = rows
+    assert np.abs(np.array(row.geometry["coordinates"][0])[:, [1, 0]] - lla[:, :2]).max() < 1e-9  # deg, 0.1 mm
+    with fiona.open(tmp_path / "a.gpx", layer="track_points") as rows:
+        points = list(rows)
+    assert [p.properties["ele"] for p in points] == pytest.approx(lla[:, 2], abs=1e-4)  # m
+    assert points[0].properties["time"].startswith("2025-06-01T10:00:00")
+
+
+def test_geojson_is_read_by_ogr_epoch_by_epoch(solution, lla, fiona, tmp_path):
     export(solution, "geojson", tmp_path / "a.geojson", clock_epoch="unix")
-    (feature,) = json.loads((tmp_path / "a.geojson").read_text())["features"]
-    assert feature["geometry"]["type"] == "LineString"
-    assert np.array_equal(np.array(feature["geometry"]["coordinates"])[:, [1, 0, 2]], lla)
-    properties = feature["properties"]
-    assert properties["t_ns"] == solution.t_ns.tolist()
-    assert properties["elapsed_s"] == solution.seconds.tolist()
-    assert properties["sigma_u_m"] == pytest.approx([2.0] * 40)
-    assert properties["coordTimes"][0] == UTC0
+    with fiona.open(tmp_path / "a.geojson") as rows:
+        features = list(rows)
+    line, *points = features
+    assert np.array_equal(np.array(line.geometry["coordinates"])[:, [1, 0, 2]], lla)
+    assert np.array_equal(np.array([p.geometry["coordinates"] for p in points])[:, [1, 0, 2]], lla)
+    assert [p.properties["t_ns"] for p in points] == solution.t_ns.tolist()
+    assert [p.properties["elapsed_s"] for p in points] == solution.seconds.tolist()
+    assert {p.properties["sigma_u_m"] for p in points} == {2.0}
+    assert str(points[0].properties["time"]).startswith("2025-06-01T10:00:00.123")
+
+
+def test_geojson_without_absolute_time(solution, tmp_path):
     export(solution, "geojson", tmp_path / "b.geojson")
-    assert "coordTimes" not in json.loads((tmp_path / "b.geojson").read_text())["features"][0]["properties"]
+    line, first, *_ = json.loads((tmp_path / "b.geojson").read_text())["features"]
+    assert "time" not in first["properties"]
+    assert "no absolute time" in line["properties"]["description"]
 
 
 def test_geojson_of_an_unknown_covariance_is_valid_json(solution, tmp_path):
     blind = dataclasses.replace(solution, covariance=np.full((40, 15, 15), np.nan))
     export(blind, "geojson", tmp_path / "a.geojson")
-    (feature,) = json.loads((tmp_path / "a.geojson").read_text())["features"]
-    assert feature["properties"]["sigma_e_m"] == [None] * 40
+    _, *points = json.loads((tmp_path / "a.geojson").read_text())["features"]
+    assert {point["properties"]["sigma_e_m"] for point in points} == {None}
 
 
 @pytest.mark.parametrize("format", ["kml", "gpx", "geojson"])
