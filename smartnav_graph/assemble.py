@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.errors import SessionError
+from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import Memory, State, Window
@@ -22,6 +23,7 @@ from smartnav_graph.smoothers.estimate import Estimate, values_of
 from smartnav_graph.smoothers.whole_graph import Stack
 from smartnav_graph.solution import Residuals, Solution
 from smartnav_graph.timebase import NS, interpolate, ns_from_seconds
+from smartnav_graph.track_gate import whitened
 
 Floats = NDArray[np.float64]
 # Stamps (m,), sensor, whitened residuals (m, d), weight (m,), used (m,).
@@ -106,6 +108,9 @@ def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals
         parts += _of_late_rows(builder.name, problem, estimate)
     for sensor in sorted({block.sensor for block in estimate.blocks} - set(positions)):
         parts += [_of_stack(stack, estimate) for stack in estimate.stacks(sensor)]
+    tracks = whitened(problem.builders, estimate, memory)
+    if tracks is not None:
+        parts.append((tracks[0], SMART, tracks[1], tracks[2].astype(np.float64), tracks[2]))
     native: dict[str, tuple[list[int], list[Floats]]] = {}
     for tag, factor in estimate.factors:
         if tag.sensor not in positions and isinstance(factor, gtsam.NoiseModelFactor) and tag.sensor != "prior":

@@ -21,6 +21,7 @@ from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.magnetometer import MagnetometerConfig
 from smartnav_graph.factors.pose_fix import PoseFixConfig
 from smartnav_graph.factors.prior import PriorConfig
+from smartnav_graph.factors.smart import SmartConfig
 from smartnav_graph.factors.step import StepConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
 from smartnav_graph.factors.velocity import VelocityConfig
@@ -102,6 +103,7 @@ class Config:
     barometer: BarometerConfig = field(default_factory=BarometerConfig)
     steps: StepConfig = field(default_factory=StepConfig)
     coplanarity: CoplanarityConfig = field(default_factory=CoplanarityConfig)
+    smart: SmartConfig = field(default_factory=SmartConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)

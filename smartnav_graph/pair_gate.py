@@ -126,9 +126,9 @@ class Account:
 
 
 def account(builders: Iterable[Builder], memory: Memory) -> Account | None:
-    """The account of the image pairs of a run; None where there are none."""
+    """The account of the image pairs of a run; None where there are none, or others stand in for them."""
     for builder in builders:
-        if isinstance(builder, CoplanarityBuilder):
+        if isinstance(builder, CoplanarityBuilder) and not builder.replaced(memory):
             verdict = builder.verdict_of(memory)
             count = np.bincount(verdict, minlength=len(REASONS))
             inside = verdict[builder.pairs.pair] == IN_USE

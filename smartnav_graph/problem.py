@@ -114,7 +114,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
-    pairs = pairs_of(session, config.coplanarity)
+    pairs = pairs_of(session, config.coplanarity, smart=config.smart.enabled)
     seen = None if pairs is None else still_periods(pairs)
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still, seen)
     context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal, pairs)

@@ -25,6 +25,7 @@ from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
 from smartnav_graph.pair_gate import settled
 from smartnav_graph.row_noise import row_scales
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.track_gate import ROUNDS, chosen, smart_of
 from smartnav_graph.variance import noise_scales
 
 Floats = NDArray[np.float64]
@@ -180,6 +181,7 @@ def revise(
     if new.stage < LAST_STAGE:
         return new, done
     judged = settled(builders, estimate, new)
+    judged = chosen(builders, estimate, judged) if judged is new else judged
     return judged, done and judged is new
 
 
@@ -232,8 +234,10 @@ def _graduated(judged: Sequence[Verdict], memory: Memory) -> Memory | None:
 
 
 def extra_passes(builders: Iterable[Builder]) -> int:
-    """Passes that a graduated loss needs beyond those of the others."""
-    return GRADUATED_PASSES if any(b.config.loss == "gnc" for b in position_builders(builders)) else 0
+    """Passes that a graduated loss, and tracks that follow on image pairs, need beyond those of the others."""
+    builders = list(builders)
+    graduated_too = any(b.config.loss == "gnc" for b in position_builders(builders))
+    return GRADUATED_PASSES * graduated_too + ROUNDS * (smart_of(builders) is not None)
 
 
 def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from smartnav_graph import track_gate
 from smartnav_graph.assemble import Withheld, used_counts
-from smartnav_graph.factors.coplanarity import CONTRARY, REASONS
+from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
 from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
 from smartnav_graph.pair_gate import Account, account
@@ -23,6 +24,7 @@ from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
 from smartnav_graph.start import Initial
+from smartnav_graph.track_gate import POINT_DOF
 from smartnav_graph.variance import NOISE_NAMES
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
@@ -49,7 +51,12 @@ def peak_memory_mb() -> float:
 
 
 def _chi2_per_dof(
-    problem: Problem, estimate: Estimate, memory: Memory, solution: Solution, seen: Account | None
+    problem: Problem,
+    estimate: Estimate,
+    memory: Memory,
+    solution: Solution,
+    seen: Account | None,
+    tracks: track_gate.Account | None,
 ) -> dict[str, float]:
     """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
 
@@ -65,13 +72,17 @@ def _chi2_per_dof(
     }
     count = sum(int(mask.sum()) for mask in rows.values())
     # the position is free of any prior; each chain and session state has one equation of its own
-    total = max(count - STATE_DIM * len(estimate.indices) + 12, 1)
+    eliminated = POINT_DOF * tracks.points if tracks is not None and tracks.in_force else 0
+    total = max(count - eliminated - STATE_DIM * len(estimate.indices) + 12, 1)
     result = {"overall": 2.0 * estimate.cost / total}
     left = float(total)
     if seen is not None and seen.redundancy > 0:
         left -= seen.redundancy
         inside = rows.get("coplanarity", np.zeros(0, dtype=bool))  # within their gate; the loss would make it too small
         result["coplanarity"] = float((solution.residuals.whitened[inside] ** 2).sum()) / seen.redundancy
+    if tracks is not None and tracks.in_force:
+        left -= tracks.redundancy
+        result[SMART] = squares.get(SMART, 0.0) / tracks.redundancy
     for builder in position_builders(problem.builders):
         if builder.name in memory.correlated:
             continue
@@ -123,11 +134,11 @@ def summarise(
     for block in estimate.blocks:
         factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, memory))
-    seen = account(problem.builders, memory)
-    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes, seen)
+    seen, tracks = account(problem.builders, memory), track_gate.account(problem.builders, memory)
+    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes, seen, tracks)
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
-    told = [seen.refused] if seen is not None and seen.refused else []
+    told = [one.refused for one in (seen, tracks) if one is not None and one.refused]
     warnings = [*problem.warnings, *told, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
     summary: dict[str, Any] = {
         "mode": "batch" if absolute else "dead-reckoning",
@@ -159,8 +170,9 @@ def summarise(
         "standstills": _standstills(problem),
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used_counts(problem, memory)),
-        "rejected": _rejected(memory, seen),
+        "rejected": _rejected(memory, seen, tracks),
         **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
+        **({} if tracks is None else {"tracks": dict(tracks.tracks)}),
         "rejections": rejections(problem, estimate, memory),
         "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
         "position_sigma_m": _sigma_summary(keyframes),
@@ -171,11 +183,14 @@ def summarise(
     return summary | dict(extra)
 
 
-def _rejected(memory: Memory, seen: Account | None) -> dict[str, int]:
-    """Rows rejected as outliers, by sensor; image pairs that contradict the way, and matches of those that do not."""
-    found = {name: len(rows) for name, rows in memory.rejected.items()}
+def _rejected(memory: Memory, seen: Account | None, tracks: track_gate.Account | None) -> dict[str, int]:
+    """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the way, and matches and
+    observations of those that do not."""
+    found = {name: len(rows) for name, rows in memory.rejected.items() if name not in ("coplanarity", "matches")}
     if seen is not None:
         found |= {"coplanarity": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
+    if tracks is not None and tracks.in_force:
+        found |= {SMART: tracks.contrary, "tracks": tracks.outliers}
     return found
 
 

@@ -69,7 +69,7 @@ class SeenPairs:
         for builder in problem.builders:
             if isinstance(builder, CoplanarityBuilder):
                 use, verdict = builder.used_matches(memory), builder.verdict_of(memory)
-                return cls(camera_name(problem.session, problem.calibration), builder.pairs, use, verdict)
+                return cls(camera_name(problem.session, problem.calibration), builder.seen, use, verdict)
         return None
 
 

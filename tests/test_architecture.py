@@ -15,7 +15,7 @@ ORDER = (
     *("readers", "simulation", "vision"),
     *("solution", "losses", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "start", "initialise"),
-    *("config", "withhold", "problem", "variance", "row_noise", "pair_gate", "revise"),
+    *("config", "withhold", "problem", "variance", "row_noise", "pair_gate", "track_gate", "revise"),
     *("first_state", "rejections", "assemble", "influence", "summary", "trace", "estimate"),
     *("evaluation", "intervals", "export", "report", "rerun_log", "run_folder", "cli", "__main__"),
 )

@@ -13,6 +13,7 @@ from smartnav_graph.factors import (
     imu,
     magnetometer,
     pose_fix,
+    smart,
     standstill,
     step,
     vehicle,
@@ -39,4 +40,5 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "barometer": barometer.build,
     "steps": step.build,
     "coplanarity": coplanarity.build,
+    "smart": smart.build,
 }

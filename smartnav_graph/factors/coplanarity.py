@@ -32,6 +32,8 @@ Mask = NDArray[np.bool_]
 
 # How sure the turn between two images is, rad and rad/s: what is left of the gyro's bias and noise.
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
+# The builder that stands in for pairs once they are settled and it has judged what it is made of.
+SMART = "smart"
 # Share of its matches that a pair must keep.
 LEAST_SHARE = 0.5
 # Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, again and compressed.
@@ -156,6 +158,8 @@ class CoplanarityBuilder:
         )
 
     def _add_pairs(self, step: Step, ending: NDArray[np.intp], memory: Memory) -> None:
+        if self.replaced(memory):
+            return
         verdict = self.verdict_of(memory)
         ending = ending[np.isin(verdict[ending], [IN_USE, CONTRARY])]
         if not len(ending):
@@ -171,6 +175,10 @@ class CoplanarityBuilder:
             keys.append(tuple(next(of[a]) if a in of else step.use(states[a]) for a in self.rig.letters))
             data[row] = [pair, *self.rate[images].ravel()]
         step.blocks.append(Block(self.name, model, keys, data, step.t_ns, rows=tuple(ending.tolist()), used=used))
+
+    def replaced(self, memory: Memory) -> bool:
+        """Whether tracks stand in for the pairs in a pass with this memory."""
+        return memory.settled.get(SMART, 0) > 0 and memory.phase != "causal"
 
     def verdict_of(self, memory: Memory) -> NDArray[np.intp]:
         """What became of each pair (n,) in a pass with this memory."""
@@ -278,9 +286,10 @@ class CoplanarityBuilder:
         return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
 
 
-def pairs_of(session: Session, config: CoplanarityConfig) -> Pairs | None:
-    """Image pairs of a session: as they were matched, else along tracks; None where images are not to be used."""
-    if not config.enabled:
+def pairs_of(session: Session, config: CoplanarityConfig, *, smart: bool = False) -> Pairs | None:
+    """Image pairs of a session: as they were matched, else along tracks; None where images are not to be used, neither
+    by pairs nor (`smart`) by tracks, which takes the images of the pairs."""
+    if not (config.enabled or smart):
         return None
     if session.matches is not None:
         return of_matches(session.matches)
@@ -290,7 +299,7 @@ def pairs_of(session: Session, config: CoplanarityConfig) -> Pairs | None:
 def build(context: FactorContext) -> CoplanarityBuilder | None:
     """The builder of a session's image pairs."""
     pairs, config = context.pairs, context.config.coplanarity
-    if pairs is None or not len(pairs):
+    if pairs is None or not len(pairs) or not config.enabled:
         return None
     eye = eye_of(context, config)
     return CoplanarityBuilder(

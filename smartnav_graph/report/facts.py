@@ -43,6 +43,7 @@ SENSORS = {
     "tracks": ("Tracked points", "tracked point", "tracked points"),
     "matches": ("Matched points", "matched point", "matched points"),
     "coplanarity": ("Image pairs", "image pair", "image pairs"),
+    "smart": ("Tracks in space", "track", "tracks"),
     "static_turn": ("Rests without turn", "rest without turn", "rests without turn"),
 }
 HOLES = {"bridged": "bridged by interpolation", "missing": "no samples"}

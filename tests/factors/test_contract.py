@@ -33,9 +33,9 @@ HONEST = {
     "control": np.full(3, 1e-9),
 }
 TAGS = {"imu": ("imu", "imu_bias"), "gnss": ("gnss",), "control": ("control",)}
-# A standstill measures nothing: no unit, no noise, no clock; see test_standstill_factor. Image pairs tie two states:
-# see test_coplanar_rows and test_coplanarity.
-ELSEWHERE = {"static", "coplanarity"}
+# A standstill measures nothing: no unit, no noise, no clock; see test_standstill_factor. Image pairs and
+# tracks tie several states: see test_coplanar_rows, test_coplanarity, test_smart and test_smart_tracks.
+ELSEWHERE = {"static", "coplanarity", "smart"}
 SHIFT_NS = NS // 10
 
 Wrong = Callable[[Session], Session]

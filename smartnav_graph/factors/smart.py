@@ -1,0 +1,184 @@
+"""Tracks as points in space: every track one native smart factor on the poses of all keyframes that saw it.
+
+    r_i = proj((nav_T_body_i body_T_cam)^-1 X) - x_i,   X the point of the track, eliminated in the factor itself
+
+with x_i in undistorted normalised coordinates. Linearised, a track of l observations is 2 l - 3 rows on l poses: what
+is left once the point is projected out of the null space of its derivatives. A point far away or seen under a small
+angle would be no number, and a wrong observation has no loss of its own, so tracks join late and checked: when image
+pairs have settled the trajectory (or inertial data and fixes alone, where pairs are not asked for), the points are
+found at its states, and what disagrees is left out (`track_gate`). From there on tracks stand in for the pairs, which
+say the same.
+
+Boresight and clock of the camera, found with the pairs, are held. The keyframe stands at the stamp of the image; what
+an observation made d later (clock, row of a rolling shutter) differs by at the point and motion found is taken off it.
+
+Source: Carlone, Kira, Beall, Indelman, Dellaert (2014), Eliminating conditionally independent sets in factor graphs,
+ICRA (SmartProjectionPoseFactor of GTSAM).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.errors import ConfigError
+from smartnav_graph.factors.camera import BodyRates, Eye, eye_of
+from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.coplanarity import SMART
+from smartnav_graph.factors.observation import exp
+from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
+from smartnav_graph.timebase import NS
+from smartnav_graph.vision.points import Sightings, of_tracks
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A track needs so many observations: with two, the point takes all but what a pair says.
+LEAST_SEEN = 3
+# Unit of the factors' coordinates: GTSAM ends the search for a point at an absolute change of the squares by one.
+FOCAL = 1e6
+# Singular value of the triangulation below which a point has no place, normalised coordinates.
+RANK = 1e-6
+# Points are found again whenever a pose moves at all.
+AGAIN = 1e-9
+
+
+@dataclass(frozen=True)
+class SmartConfig:
+    """enabled : tracks as points in space, in place of image pairs once those are settled (batch, and the polish of a
+    replay); most_seen : observations of one factor, longer tracks are split; least_parallax : rad, between the first
+    ray of a point and another."""
+
+    enabled: bool = False
+    most_seen: int = 20
+    least_parallax: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (self.most_seen >= LEAST_SEEN and self.least_parallax > 0):
+            found = f"most_seen = {self.most_seen}, least_parallax = {self.least_parallax}"
+            raise ConfigError("config [smart]", found, f"at least {LEAST_SEEN}, > 0")
+
+
+# Why a track is not used, in words.
+REASONS = (
+    "in use",
+    "outside the stretch",
+    "seen too seldom",
+    "no parallax to speak of",
+    "contradicts the way",
+)
+IN_USE, OUTSIDE, FEW, FLAT, CONTRARY = range(len(REASONS))
+
+
+@dataclass
+class SmartBuilder:
+    """Adds a track at the keyframe that saw it last.
+
+    image_ns (k,) : keyframe stamps of the images; sigma : of an observation, normalised
+    use (n, l) : observations in use; xy (n, l, 2) : what they are as seen at their keyframe; boresight (3,) rad
+    verdict (n,) : what became of each track, places in `REASONS`; refused : why none is used, in words
+    """
+
+    sightings: Sightings
+    image_ns: NDArray[np.int64]
+    rates: BodyRates
+    eye: Eye
+    sigma: float
+    merge_ns: int
+    config: SmartConfig = field(default_factory=SmartConfig)
+    name: str = SMART
+    stage: int = 1
+    refused: str = ""
+    use: Mask = field(init=False)
+    xy: Floats = field(init=False)
+    boresight: Floats = field(default_factory=lambda: np.zeros(3))
+    verdict: NDArray[np.intp] = field(init=False)
+    _keyframe: dict[int, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.use, self.xy = self.sightings.there.copy(), self.sightings.xy.copy()
+        self.verdict = np.full(len(self.sightings), OUTSIDE, dtype=np.intp)
+
+    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+        """The tracks that end at the window's end."""
+        if previous is None:
+            self._keyframe = {}
+        near = int(np.searchsorted(self.image_ns, window.t1_ns - self.merge_ns))
+        if near == len(self.image_ns) or self.image_ns[near] > window.t1_ns + self.merge_ns:
+            return
+        self._keyframe[near] = window.index
+        if not self.in_force(memory):
+            return
+        for state in self.eye.states().values():
+            step.use(state)
+        first, last = np.searchsorted(self.sightings.last, [near, near + 1])
+        for row in range(first, last):
+            if self.verdict[row] == IN_USE:
+                step.add(Tag(self.name, step.t_ns, row), self._factor(row, memory))
+
+    def in_force(self, memory: Memory) -> bool:
+        """Whether tracks stand in for image pairs in a pass with this memory."""
+        return memory.settled.get(self.name, 0) > 0 and memory.phase != "causal"
+
+    def _factor(self, row: int, memory: Memory) -> Any:
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, FOCAL * self.sigma * memory.scale(self.name))
+        factor = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _IDEAL, self._mount, _PARAMS)
+        for place in np.flatnonzero(self.use[row]):
+            factor.add(FOCAL * self.xy[row, place], key("X", self._keyframe[int(self.sightings.image[row, place])]))
+        return factor
+
+    @property
+    def body_R_cam(self) -> Floats:
+        """With the boresight found."""
+        return np.asarray(self.eye.rig.body_R_cam @ exp(self.boresight[None])[0])
+
+    @property
+    def _mount(self) -> Any:
+        return gtsam.Pose3(gtsam.Rot3(self.body_R_cam), self.eye.rig.body_t_cam)
+
+
+def _params() -> Any:
+    """Rows by projection onto the null space, which QR takes as they are; a point that a candidate sends behind a
+    camera counts as one at infinity, which costs, instead of nothing, which would pay."""
+    modes = gtsam.LinearizationMode.JACOBIAN_SVD, gtsam.DegeneracyMode.HANDLE_INFINITY
+    params = gtsam.SmartProjectionParams(*modes, False, False, AGAIN)
+    params.setEnableEPI(True)
+    params.setRankTolerance(FOCAL * RANK)
+    return params
+
+
+_IDEAL, _PARAMS = gtsam.Cal3_S2(FOCAL, FOCAL, 0.0, 0.0, 0.0), _params()
+
+
+def build(context: FactorContext) -> SmartBuilder | None:
+    """The builder of a session's tracks, where they are asked for.
+
+    Raises
+    ------
+    ConfigError
+        There are none, or nothing would use them.
+    """
+    config, pairs, tracks = context.config.smart, context.pairs, context.session.tracks
+    if not config.enabled:
+        return None
+    if tracks is None or pairs is None:
+        found = "enabled, but the session has no tracks"
+        raise ConfigError("config [smart]", found, "tracks.parquet", "make them with `smartnav match --features klt`")
+    if context.causal and not context.config.replay.polish:
+        found = "enabled in a replay without its polish"
+        expected = "a batch run or a polish: a track is settled once all of it was seen"
+        raise ConfigError("config [smart]", found, expected, "leave replay.polish on, or smart off")
+    eye = eye_of(context, context.config.coplanarity)
+    return SmartBuilder(
+        of_tracks(tracks, pairs.t_ns, config.most_seen),
+        context.image_ns,
+        BodyRates(context.session.require_imu()),
+        eye,
+        eye.camera.noise,
+        round(context.config.keyframes.merge_s * NS),
+        config,
+    )

@@ -1,0 +1,128 @@
+"""Tracks as points in space in whole runs: they follow on image pairs, are judged, and say what they did."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from test_coplanarity import errors
+
+from smartnav_graph import config
+from smartnav_graph.estimate import initialise, replay, smooth, solve_passes
+from smartnav_graph.factors.smart import IN_USE, REASONS
+from smartnav_graph.graph import KEYFRAME_LETTERS, key
+from smartnav_graph.problem import prepare
+from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
+from smartnav_graph.smoothers.whole_graph import WholeGraph
+
+
+def options(**sections):
+    return config.from_dict({"smart": {"enabled": True}, **sections}, "test")
+
+
+@pytest.fixture(scope="module")
+def room():
+    return simulate("room-30s", 0)
+
+
+@pytest.fixture(scope="module")
+def run(room):
+    return smooth(room, options())
+
+
+def test_tracks_hold_at_least_what_pairs_hold(room, run):
+    metres, degrees = errors(run.solution, room.reference)
+    pairs = errors(smooth(room, config.from_dict({}, "test")).solution, room.reference)
+    assert metres < 0.05 and degrees < 0.5
+    assert metres < 1.1 * pairs[0]  # 0.020 beside 0.030 m
+
+
+def test_the_covariance_is_honest(room, run):
+    rows = np.isin(room.reference.t_ns, run.solution.t_ns)
+    at = np.searchsorted(run.solution.t_ns, room.reference.t_ns[rows])
+    error = run.solution.nav_t_body[at] - room.reference.enu[rows]
+    P = run.solution.covariance[at][:, 3:6, 3:6]
+    assert 0.1 < np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error).mean() / 3 < 3.0
+
+
+def test_the_account_is_complete(run):
+    summary = run.summary
+    builder = next(b for b in run.problem.builders if b.name == "smart")
+    assert sum(summary["tracks"].values()) == len(builder.sightings)
+    assert summary["factors"]["smart"] == summary["tracks"][REASONS[IN_USE]] > 300
+    assert "coplanarity" not in summary["factors"] and "image_pairs" not in summary
+    assert summary["chi2_per_dof"]["smart"] == pytest.approx(1.0, abs=0.1)
+    assert 0.7 < summary["chi2_per_dof"]["overall"] < 1.3
+    residuals = run.solution.residuals
+    inside = residuals.of("smart")
+    count = builder.use[builder.verdict == IN_USE].sum()
+    assert (inside & residuals.used).sum() == 2 * count
+    assert summary["rejected"]["tracks"] == (inside & ~residuals.used).sum() // 2
+
+
+def test_what_the_pairs_found_of_the_camera_is_held(run):
+    states = run.summary["states"]
+    assert states["images_time_offset_s"]["held"] and states["camera_boresight_rad"]["held"]
+    assert states["images_time_offset_s"]["value"] == pytest.approx(0.0, abs=0.002)
+
+
+def test_wrong_observations_are_left_out():
+    room = SCENARIOS["room-30s"]
+    faults = replace(room.camera.faults, outliers=(0.1, 0.2), glitches=((12.0, 17.0),))
+    session = replace(room, camera=replace(room.camera, faults=faults))(0)
+    found = smooth(session, options())
+    metres, degrees = errors(found.solution, session.reference)
+    assert metres < 0.06 and degrees < 0.5
+    assert found.summary["rejected"]["tracks"] > 300
+
+
+def test_a_camera_that_is_late_and_reads_row_by_row():
+    """Clock 15 ms and boresight off by half a degree, 30 ms of readout: taken off every observation at its point."""
+    room = SCENARIOS["room-30s"]
+    camera = replace(room.camera.camera, readout_s=0.03)
+    session = replace(room, camera=replace(room.camera, camera=camera, clock_s=0.015, boresight_deg=(0.3, -0.3, 0.2)))(
+        0
+    )
+    assert errors(smooth(session, options()).solution, session.reference)[0] < 0.06
+
+
+def test_tracks_of_something_else_are_refused(room):
+    rng = np.random.default_rng(0)
+    noise = room.replace(tracks=replace(room.tracks, xy_n=rng.uniform(-0.5, 0.5, room.tracks.xy_n.shape), xy_px=None))
+    found = smooth(noise, options())
+    alone = smooth(room, config.from_dict({"coplanarity": {"enabled": False}}, "test"))
+    assert any("smart: tracks are refused as the image pairs are" in text for text in found.summary["warnings"])
+    assert errors(found.solution, room.reference)[0] <= 1.1 * errors(alone.solution, room.reference)[0]
+
+
+def test_without_pairs_tracks_are_judged_by_the_rest_alone(room):
+    """Half a minute of a phone's accelerometer is too poor: refused, and told."""
+    found = smooth(room, options(coplanarity={"enabled": False}))
+    assert any("smart: refused, only" in text for text in found.summary["warnings"])
+    assert "smart" not in found.summary["factors"] and found.summary["rejected"].get("smart") is None
+
+
+def test_a_replay_has_pairs_and_its_polish_tracks(room, run):
+    replayed = replay(room, options())
+    assert "smart" in replayed.summary["factors"]
+    np.testing.assert_allclose(replayed.solution.nav_t_body, run.solution.nav_t_body, atol=0.01)  # m
+    pairs = replay(room, config.from_dict({"replay": {"polish": False}}, "test"))
+    np.testing.assert_allclose(replayed.causal.nav_t_body, pairs.causal.nav_t_body, atol=1e-9)
+
+
+def test_marginals_are_those_of_the_whole_system(room):
+    """The recursion over the Bayes net, whose keyframes are tied over many, beside a dense inverse."""
+    problem = prepare(room, options(run={"end_s": 9.0}))
+    initial = initialise(problem)
+    estimate, memory, _ = solve_passes(problem, problem.windows, initial.prior, initial.memory, warm=initial.warm)
+    assert memory.settled["smart"] == 2
+    held = {state.key: state.value for state in estimate.session.values() if state.held}
+    linear = WholeGraph([factor for _, factor in estimate.factors], estimate.blocks, held).linearize(estimate.values)
+    order = gtsam.Ordering()
+    for index in estimate.indices:
+        for letter in KEYFRAME_LETTERS:
+            order.push_back(key(letter, index))
+    dense = np.linalg.inv(linear.hessian(order)[0])
+    for k in range(0, len(estimate.indices), 5):
+        block = dense[15 * k : 15 * k + 15, 15 * k : 15 * k + 15]
+        np.testing.assert_allclose(estimate.marginals.joint[k], block, rtol=1e-3, atol=1e-7)
