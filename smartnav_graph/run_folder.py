@@ -28,7 +28,7 @@ from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.export import write_trajectory_csv
 from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.frames import Origin
-from smartnav_graph.influence import FACTORS, Influence
+from smartnav_graph.influence import Influence
 from smartnav_graph.session import Session, write_table
 from smartnav_graph.solution import Residuals, Solution
 
@@ -263,25 +263,6 @@ def read_run(path: str | Path) -> StoredRun:
         summary=summary,
         causal=_read_states(causal, key) if causal.is_file() else None,
     )
-
-
-def read_influence(path: str | Path) -> Influence:
-    """The linear system that a run left in its folder.
-
-    Raises
-    ------
-    SessionError
-        The run has none, or it cannot be read.
-    """
-    try:
-        return Influence.read(Path(path))
-    except FileNotFoundError as error:
-        missing = Path(str(error.filename or "influence.parquet")).name
-        raise SessionError(
-            path, f"holds no {missing}", "a run that can be explained", "smooth the session again"
-        ) from error
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(Path(path) / FACTORS, error) from error
 
 
 def _read_states(path: Path, key: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:

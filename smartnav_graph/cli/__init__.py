@@ -33,7 +33,8 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "replay": ("runs", "Replay", "the same one window at a time, causal"),
     "evaluate": ("scores", "Evaluate", "a run against a reference"),
     "intervals": ("intervals", "Intervals", "how far a solution strays between fixes"),
-    "compare": ("scores", "Compare", "a run against another run"),
+    "explain": ("inspection", "Explain", "what determined the state of a run at one instant"),
+    "compare": ("inspection", "Compare", "a run against another run"),
     "export": ("runs", "Export", "a run as TUM, KML, GeoJSON, GPX or CSV"),
     "view": ("sessions", "View", "sessions and runs in the Rerun viewer"),
 }

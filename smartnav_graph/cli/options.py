@@ -19,6 +19,7 @@ from smartnav_graph.config import Config
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 Text = str | None
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SESSION")]
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="PATH")]
 Repairs = Annotated[Text, tyro.conf.arg(name="repair", metavar="A,B")]
 

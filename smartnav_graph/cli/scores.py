@@ -9,14 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from smartnav_graph.cli.options import Command, Switch
+from smartnav_graph.cli.options import Command, RunPath, Switch
 from smartnav_graph.cli.text import statistics_line
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.evaluation import Evaluation, evaluate
 from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.run_folder import plain, read_run
-
-RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,37 +76,3 @@ def evaluation_text(found: Evaluation) -> str:
     told_nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
     lines += [f"NEES        {told_nees} (expected 3; yaw 1)"] if told_nees else []
     return "\n".join([*lines, *found.notes])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Compare(Command):
-    """A run against another: how far apart they are, how their sigmas differ, and what was asked of each.
-
-    Example: smartnav compare kitti-run kitti-replay
-    """
-
-    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN1")]
-    """Run folder."""
-    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN2")]
-    """Run folder."""
-    json: Switch = False
-    """Print JSON, and nothing else, on stdout."""
-
-    def run(self) -> None:
-        from smartnav_graph.evaluation.compare import compare
-        from smartnav_graph.run_folder import config_differences
-
-        found = compare(read_run(self.first).solution, read_run(self.second).solution)
-        options = config_differences(self.first, self.second)
-        if self.json:
-            print(json.dumps(plain({**found.to_dict(), "config": options}), allow_nan=False))
-            return
-        print(f"{found.epochs} common epochs of {self.first} and {self.second}")
-        for name, unit in (("position", "m"), ("rotation", "deg"), ("velocity", "m/s")):
-            print(statistics_line(name, unit, found.to_dict()[f"{name}_{unit.replace('/', '_')}"]))
-        print(
-            f"sigma       median ratio second / first: position {found.sigma_ratio['position']:.3f}, "
-            f"rotation {found.sigma_ratio['rotation']:.3f}, velocity {found.sigma_ratio['velocity']:.3f}"
-        )
-        for key, (one, other) in options.items():
-            print(f"config      {key}: {one} | {other}")

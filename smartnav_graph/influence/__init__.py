@@ -6,14 +6,14 @@ of keyframe k, the row f moves the state of that keyframe by K_f b_f, with K = P
     sum_f K_f K_f^T = P_kk        share of f in the variance of component i: K_if^2 / P_ii, one in all
     sum_f K_f b_f = 0             pulls balance: the solution is where they do
 
-A share is also the square of a sensitivity: f moved by its own sigma moves component i by sqrt(share) sigmas. What
-touches the keyframe itself pulls by P_kk J_fk^T b_f, and tells J_fk^T J_fk as if all its neighbours were known. What
-the state rests on shows when it is gone: P without the rows of one source.
+A share is also the square of a sensitivity: f moved by its own sigma moves component i by sqrt(share) sigmas. A pull is
+how far the residual of f draws the state against all others. The factors that touch the keyframe tell J_fk^T J_fk as if
+all its neighbours were known. What the state rests on shows when it is gone: P without the rows of one source.
 
 Source: Teunissen (2003), Adjustment theory, 2.4; Cook, Weisberg (1982), Residuals and Influence in Regression, 2.
 """
 
-from smartnav_graph.influence.factors import CALIBRATION, FACTORS, Group, Influence, Keyframes
+from smartnav_graph.influence.factors import CALIBRATION, FACTORS, KEYFRAMES, Group, Influence, Keyframes
 from smartnav_graph.influence.holding import Held, Measurements, held
 
-__all__ = ["CALIBRATION", "FACTORS", "Group", "Held", "Influence", "Keyframes", "Measurements", "held"]
+__all__ = ["CALIBRATION", "FACTORS", "KEYFRAMES", "Group", "Held", "Influence", "Keyframes", "Measurements", "held"]

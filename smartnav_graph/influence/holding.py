@@ -19,8 +19,8 @@ from smartnav_graph.influence.factors import Influence, builder_of, indices, let
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A sigma that grows by more than this factor without a source: the state is not determined without it.
-UNDETERMINED = 100.0
+# A sigma that grows by more than this factor without a source: the component is lost without it.
+LOST = 100.0
 # Share of the diagonal that carries the elimination past what nothing holds.
 RIDGE = 1e-13
 
@@ -45,9 +45,10 @@ class Held:
     sources : names of the s builders of the whole graph, and `CALIBRATION`
     share (s, 15) : of each component's variance, by source; here (s, 15) : the part of it from factors that touch this
     keyframe and no other
-    without (s, 15) : sigma without the source over sigma, inf where nothing determines the component then
-    touching (s,) : factors that touch the keyframe; pull (s, 15) : what they exert, in sigmas; own (s, 15) : sigma that
-    they alone would leave to a component if all else were known, inf where they tell nothing of it
+    pull (s, 15) : how far each source draws the state against the others, in sigmas; touching (s,) : factors that touch
+    the keyframe; pull_here (s, 15) : the part of the pull that is theirs; own (s, 15) : sigma that they alone would
+    leave to a component if all else were known, inf where they tell nothing of it
+    without (s, 15) : sigma without the source over sigma, inf beyond `LOST`
     """
 
     place: int
@@ -55,10 +56,11 @@ class Held:
     sources: Sequence[str]
     share: Floats
     here: Floats
-    without: Floats
-    touching: NDArray[np.int64]
     pull: Floats
+    touching: NDArray[np.int64]
+    pull_here: Floats
     own: Floats
+    without: Floats
     measurements: Measurements
 
     @property
@@ -84,26 +86,27 @@ def held(influence: Influence, place: int) -> Held:
     sigma, by_source, own = np.sqrt(variance), system.by_source, system.J[:, columns] @ turn.T
     without = np.array([system.sigma_without(s, columns, turn) for s in range(len(influence.sources))]) / sigma
     K = np.asarray(system.J @ covariances @ turn.T)
-    touching, alone = system.touching(index)
-    information = by_source @ own**2
+    pull = K * system.b[:, None] / sigma
+    touching, alone = (mask[system.factor][:, None] for mask in system.touching(index))
     with np.errstate(divide="ignore"):
-        own_sigma = 1.0 / np.sqrt(information)
+        own_sigma = 1.0 / np.sqrt(by_source @ own**2)
     return Held(
         place=place,
         covariance=covariance,
         sources=influence.sources,
         share=by_source @ K**2 / variance,
-        here=by_source @ (K**2 * alone[system.factor][:, None]) / variance,
-        without=np.where(without > UNDETERMINED, np.inf, without),
-        touching=np.bincount(system.source[touching], minlength=len(influence.sources)),
-        pull=by_source @ (own * system.b[:, None]) @ covariance / sigma,
+        here=by_source @ (K**2 * alone) / variance,
+        pull=by_source @ pull,
+        touching=np.bincount(system.source[system.touching(index)[0]], minlength=len(influence.sources)),
+        pull_here=by_source @ (pull * touching),
         own=own_sigma,
+        without=np.where(without > LOST, np.inf, without),
         measurements=Measurements(
             source=np.array(influence.sources, dtype=object)[system.source],
             t_ns=np.concatenate([group.t_ns for group in influence.groups]),
             row=np.concatenate([group.row for group in influence.groups]),
             share=system.by_factor @ K**2 / variance,
-            pull=system.by_factor @ (K * system.b[:, None]) / sigma,
+            pull=system.by_factor @ pull,
         ),
     )
 

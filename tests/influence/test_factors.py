@@ -52,7 +52,7 @@ def test_a_fix_pulls_against_its_residual(run, influence):
     last = len(influence.keyframes) - 1
     found, rows = held(influence, last), run.solution.residuals
     mine = rows.of("gnss") & (rows.t_ns == influence.keyframes.t_ns[last])
-    pull = found.pull[found.sources.index("gnss"), 3:6]
+    pull = found.pull_here[found.sources.index("gnss"), 3:6]
     assert (np.sign(pull) == -np.sign(rows.whitened[mine])).all()
 
 
@@ -62,7 +62,7 @@ def test_a_round_trip_is_exact(influence, tmp_path):
     one, other = held(influence, 5), held(back, 5)
     assert one.sources == other.sources
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12)
-    for name in ("share", "here", "without", "pull", "own"):
+    for name in ("share", "here", "without", "pull", "pull_here", "own"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9, err_msg=name)
     assert back.keyframes.kind.tolist() == influence.keyframes.kind.tolist()
 

@@ -72,7 +72,8 @@ def test_shares_pulls_and_absences_along_a_chain():
     # K of the near fix is P = 3/4, of the link P sqrt(2) / 3, of the far fix P / 3
     np.testing.assert_allclose(found.share[:, EAST], [0.75 + 0.75 / 9, 0.75 * 2 / 9, 0.0], atol=1e-12)
     np.testing.assert_allclose(found.here[:, EAST], [0.75, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(found.pull[:, EAST], np.array([-0.5625, 0.5625, 0.0]) / np.sqrt(0.75), atol=1e-12)
+    pulls = np.array([[-0.5625 + 0.1875, 0.375, 0.0], [-0.5625, 0.375, 0.0]]) / np.sqrt(0.75)  # K_f b_f
+    np.testing.assert_allclose([found.pull[:, EAST], found.pull_here[:, EAST]], pulls, atol=1e-12)
     np.testing.assert_allclose(found.without[imu, EAST], 1.0 / np.sqrt(0.75))
     assert np.isinf(found.without[gnss, EAST])
     np.testing.assert_allclose(found.own[[gnss, imu], EAST], [1.0, np.sqrt(2.0)])

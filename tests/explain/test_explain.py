@@ -1,0 +1,132 @@
+"""What determined a state, told of a run: the right instant, the right words, and errors that help."""
+
+import json
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import smartnav_graph as sn
+from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.explain import explain
+from smartnav_graph.explain.nearby import nearby
+from smartnav_graph.graph import key
+from smartnav_graph.influence import Group, Influence, Keyframes, Measurements
+from smartnav_graph.run_folder import plain, read_run, write_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("runs") / "run"
+    write_run(sn.run(sn.simulate("figure-eight-60s", 3), end_s=20.0), path, report=False, recording=False)
+    return path
+
+
+@pytest.fixture
+def stored(folder):
+    return read_run(folder)
+
+
+def told(found, start: str) -> str:
+    """The one sentence that begins so."""
+    (sentence,) = [sentence for sentence in found.sentences if sentence.startswith(start)]
+    return sentence
+
+
+def test_without_an_instant_the_least_certain_one_is_told(stored):
+    found = explain(stored)
+    horizontal = np.hypot(*stored.solution.sigmas[:, 3:5].T)
+    t_s = stored.solution.seconds[horizontal.argmax()]
+    assert told(found, "The least certain").startswith(f"The least certain instant of the run is {t_s:.2f} s")
+    assert f"known to {horizontal.max():.3f} m (1 sigma" in told(found, "The position")
+
+
+def test_an_instant_is_told_by_the_nearest_keyframe(stored):
+    at = float(stored.solution.seconds[10])
+    assert told(explain(stored, at), "At ").startswith(f"At {at:.2f} s (keyframe 11 of {len(stored.solution)}")
+    assert f"told by the nearest keyframe, at {at:.2f} s" in explain(stored, at + 0.1).sentences[0]
+
+
+def test_figures_add_up(stored):
+    figures = explain(stored, 10.0).to_dict()
+    for component in figures["components"]:
+        assert sum(component["share"].values()) == pytest.approx(1.0), component["name"]
+    assert figures["balanced"]
+    for side in ("east", "north", "up", "heading_clockwise"):
+        assert sum(pull[side] for pull in figures["pull_sigmas"].values()) == pytest.approx(0.0, abs=0.01)
+    assert json.loads(json.dumps(plain(figures), allow_nan=False))["sentences"]
+
+
+def test_positions_rest_on_the_only_fixes(stored):
+    found = explain(stored, 10.0)
+    assert re.search(r"the position\b.* would be lost", told(found, "Without the GNSS fixes"))
+    east = found.to_dict()["components"][0]
+    assert east["name"] == "east" and "gnss" in east["rests_on"] and east["sigma_factor_without"]["gnss"] is None
+    assert not [sentence for sentence in found.sentences if sentence.startswith("Without the calibration")]
+
+
+def test_a_fix_alone_beside_what_was_assumed(stored, tmp_path):
+    """One fix of 3 m and else assumptions: all of the place is its, all of the heading the first state's."""
+    x, v, b = (np.array([[key(letter, 0)]], dtype=np.uint64) for letter in "XVB")
+    t_ns, row = stored.solution.t_ns[:1], np.array([0])
+
+    def group(sensor, keys, J, pull=0.0):
+        return Group(sensor, t_ns, row, keys, np.column_stack([J, np.full(len(J), pull)])[None])
+
+    known = [group("prior", x, np.eye(6)[:3]), group("prior", v, np.eye(3)), group("prior", b, np.eye(6))]
+    frames = Keyframes(np.array([0]), t_ns, np.array(["first"], dtype=object), np.eye(3)[None])
+    Influence([*known, group("gnss", x, np.eye(6)[3:] / 3.0)], frames).write(tmp_path)
+    found = explain(replace(stored, path=tmp_path), float(stored.solution.seconds[0]))
+    assert told(found, "What is uncertain about the position").endswith("comes from the GNSS fixes (100%).")
+    assert "heading comes from the first state (as found or assumed) (100%)" in " ".join(found.sentences)
+    assert "the heading, the tilt and the velocity would be lost" in told(found, "Without the first state")
+    assert "known to 4.243 m" in told(found, "The position")  # 3 m on each of two axes
+    assert told(found, "Measured at this very instant").startswith(
+        "Measured at this very instant: east 100%, north 100%"
+    )
+    assert "keyframe 1 of 1, the first" in found.sentences[0]
+
+
+def test_what_is_near():
+    summary = {
+        "gaps": [{"start_s": 1.0, "length_s": 2.0, "kind": "bridged"}, {"start_s": 20.0, "length_s": 1.0, "kind": "m"}],
+        "standstills": {"spans_s": [[0.0, 4.0], [30.0, 31.0]]},
+        "rejections": [{"t_s": 3.0, "sensor": "gnss", "row": 3, "size_sigma": 9.0}, {"t_s": 9.0, "sensor": "a"}],
+    }
+    run = SimpleNamespace(summary=summary, solution=SimpleNamespace(t0_ns=0))
+    stamps = np.array([4.0, 7.5, 5.0]) * 1e9
+    rows = Measurements(
+        np.array(["gnss", "gnss", "imu"], dtype=object), stamps.astype(np.int64), *[np.zeros((3, 1))] * 3
+    )
+    found = nearby(run, rows, 5.0)
+    assert (found.gap.start_s, found.gap.away_s, found.gap.end_s) == (1.0, -2.0, 3.0)
+    assert (found.standstill.start_s, found.standstill.away_s) == (0.0, -1.0)
+    assert (found.rejection["sensor"], found.rejection["away_s"]) == ("gnss", -2.0)
+    assert set(found.used) == {"gnss"}
+    assert (found.used["gnss"].before_s, found.used["gnss"].after_s) == (1.0, 2.5)
+    assert nearby(run, rows, 2.0).gap.away_s == 0.0
+    nothing = nearby(SimpleNamespace(summary={}, solution=run.solution), rows, 5.0)
+    assert (nothing.gap, nothing.standstill, nothing.rejection) == (None, None, None)
+
+
+@pytest.mark.parametrize("at", [-0.5, 20.5, float("nan")])
+def test_an_instant_outside_the_run_is_refused(stored, at):
+    with pytest.raises(ConfigError, match=r"--at: .* s; expected 0\.\d* to \d+\.\d* s, where the run is"):
+        explain(stored, at)
+
+
+@pytest.mark.parametrize("missing", ["influence.parquet", "keyframes.parquet"])
+def test_a_run_without_its_system_is_refused(stored, tmp_path, missing):
+    for name in {"influence.parquet", "keyframes.parquet"} - {missing}:
+        (tmp_path / name).write_bytes((stored.path / name).read_bytes())
+    with pytest.raises(SessionError, match=f"holds no {missing}; expected a run that can be explained; smooth the"):
+        explain(replace(stored, path=tmp_path), 10.0)
+
+
+def test_a_damaged_system_is_refused(stored, tmp_path):
+    for name in ("influence.parquet", "keyframes.parquet"):
+        (tmp_path / name).write_bytes(b"nothing")
+    with pytest.raises(SessionError, match="cannot be read"):
+        explain(replace(stored, path=tmp_path), 10.0)
