@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from smartnav_graph import readers
@@ -15,13 +16,14 @@ from smartnav_graph import session as session_model
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names, progress
 from smartnav_graph.errors import CalibrationError, ConfigError, SessionError
-from smartnav_graph.run_folder import plain
+from smartnav_graph.run_folder import plain, read_run
 from smartnav_graph.session import Session
 from smartnav_graph.vision import benchmark as scores
 from smartnav_graph.vision import features as kinds
 from smartnav_graph.vision import kept, match_file
 from smartnav_graph.vision.benchmark import Published, Score
 from smartnav_graph.vision.front_end import FrontEndConfig
+from smartnav_graph.vision.map import Known, own_fixes, pose_fixes
 
 FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 
@@ -31,7 +33,9 @@ class Match(Command):
     """Matched points, or tracks, of a session's pictures; they are kept in the session, and read again by a second
     call with the same options.
 
-    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells.
+    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells. With
+    --map the session gets pose fixes instead: of its pictures in a COLMAP model, whose scale and frame are found from
+    positions that are known without it.
 
     Example: smartnav match lund --features sift
     """
@@ -57,6 +61,11 @@ class Match(Command):
     """Take the matches of this match file of 2012 instead of finding some."""
     to_file: FilePath = None
     """Write the session's matches as a match file of 2012 instead of finding some."""
+    map: Annotated[Path | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Take pose fixes from this COLMAP model (the folder with cameras, images, points3D) in which pictures of the
+    session are registered under their names, as in `smartnav match walk --map sparse/0 --known walk-run`."""
+    known: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """The run that tells where the pictures of the model were taken, to lay it on; by default the GNSS fixes."""
     camera: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
     """The camera that a match file speaks of, where the session has several."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -67,10 +76,16 @@ class Match(Command):
     """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
-        if self.from_file is not None and self.to_file is not None:
-            raise ConfigError("--to-file", "is given with --from-file", "one of them", "call twice")
+        asked = {"--from-file": self.from_file, "--to-file": self.to_file, "--map": self.map}
+        given = [name for name, path in asked.items() if path is not None]
+        if len(given) > 1:
+            raise ConfigError(given[1], f"is given with {given[0]}", "one of them", "call twice")
+        if self.known is not None and self.map is None:
+            raise ConfigError("--known", "is given without --map", "a model to lay on the run", "add --map MODEL")
         if self.benchmark:
             self._benchmark()
+        elif self.map is not None:
+            self._map(self.map)
         elif self.from_file is not None:
             self._from_file(self.from_file)
         elif self.to_file is not None:
@@ -129,6 +144,30 @@ class Match(Command):
         else:
             print(f"{path}: {len(matches)} matches of {name}")
 
+    def _map(self, path: Path) -> None:
+        folder = Path(self.session)
+        session = session_model.load(folder)
+        kept.refuse_others(folder, "pose_fixes", self.force)
+        known = own_fixes(session) if self.known is None else self._known(self.known, session)
+        found = pose_fixes(path, session, known)
+        told = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": found.similarity.sigma}
+        told["turn_sigma_deg"] = float(np.degrees(found.similarity.turn_sigma).max())
+        kept.keep(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
+        if self.json:
+            self._print_json(told)
+            return
+        print(map_text(path, told))
+        print(f"pose fixes: {folder / 'pose_fixes.parquet'}")
+
+    @staticmethod
+    def _known(path: Path, session: Session) -> Known:
+        """Positions of a run in the session's frame."""
+        run = read_run(path)
+        if run.solution.origin != session.origin:
+            found = f"has the origin {run.solution.origin}"
+            raise SessionError(path, found, f"that of the session, {session.origin}", "smooth this session")
+        return Known(run.solution.t_ns, run.solution.nav_t_body)
+
     def _one_camera(self, session: Session) -> tuple[str, Camera]:
         """The camera named, or the only one that took images."""
         there = [] if session.images is None else sorted(set(session.images.camera))
@@ -151,6 +190,16 @@ class Match(Command):
 
     def _print_json(self, value: Any) -> None:
         print(json.dumps(plain(value), allow_nan=False))
+
+
+def map_text(path: Path, told: Mapping[str, Any]) -> str:
+    """What became of a model's images, and how well it fits, for people."""
+    return (
+        f"{path}: {told['used']} images are the session's, {told['aligned']} of them with a known position; "
+        f"{told['unknown']} are not, {told['unregistered']} have no pose\n"
+        f"a unit of the model is {told['metres_a_unit']:.5g} m; it fits the known positions to {told['sigma_m']:.3g} m "
+        f"a coordinate, its axes to {told['turn_sigma_deg']:.2g} deg"
+    )
 
 
 def print_scores(found: Sequence[Score], *, all_known: bool) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Session
+from smartnav_graph.session import Mount, Session
 from smartnav_graph.streams import Images, PoseFix
 from smartnav_graph.timebase import NS, interpolate
 from smartnav_graph.vision.similarity import Similarity, align
@@ -33,12 +33,27 @@ EXAMPLES = 3  # names that an error tells
 
 
 class Known(NamedTuple):
-    """Positions of the body known without the map: t_ns (k,) ascending, nav_t_body (k, 3) m; interpolated between two
-    of them that are at most `longest_gap_s` apart."""
+    """Positions known without the map, of the point body_t (3,) m of the body: t_ns (k,) ascending, nav_t (k, 3) m;
+    interpolated between two of them that are at most `longest_gap_s` apart."""
 
     t_ns: NDArray[np.int64]
-    nav_t_body: Floats
+    nav_t: Floats
     longest_gap_s: float = 2.0
+    body_t: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def own_fixes(session: Session) -> Known:
+    """What a session itself knows of its positions: its GNSS fixes, at the antenna.
+
+    Raises
+    ------
+    SessionError
+        There are none.
+    """
+    if session.gnss is None:
+        remedy = "smooth it without the map, and give that run (--known RUN)"
+        raise SessionError(session.path or "session", "has no gnss fixes to lay a map on", "known positions", remedy)
+    return Known(session.gnss.t_ns, session.nav_position(session.gnss), body_t=session.mount("gnss").body_t)
 
 
 @dataclass(frozen=True)
@@ -78,11 +93,15 @@ def pose_fixes(
     Raises
     ------
     SessionError
-        No such reconstruction; the session has no images; no image of the map is the session's.
+        No such reconstruction; the session has no images, or pose fixes of a sensor beside the body; no image of the
+        map is the session's.
     SolverError
         Too few images have a known position, or these lie on a line.
     """
     where = "reconstruction" if not isinstance(reconstruction, str | Path) else str(reconstruction)
+    if session.mount("pose_fixes") != Mount():
+        told = "session.toml places a sensor of pose fixes"
+        raise SessionError(session.path or "session", told, "fixes of the body itself", "remove [sensors.pose_fixes]")
     if session.images is None:
         raise SessionError(session.path or "session", "no images", "an images stream", "import the pictures")
     opened = _opened(reconstruction)
@@ -90,7 +109,8 @@ def pose_fixes(
     rows = _rows(registered, session.images, where)
     poses = _poses(registered, rows, session)
     placed, there = _known_at(known, poses.t_ns)
-    found = align(poses.centres[there], poses.lever[there], placed[there], where)
+    lever = poses.lever - poses.map_R_body @ np.array(known.body_t)
+    found = align(poses.centres[there], lever[there], placed[there], where)
     counts = {"used": len(rows), "aligned": int(there.sum()), "unknown": len(registered) - len(rows)}
     counts["unregistered"] = len(opened.images) - len(registered)
     turns = Rotation.from_matrix(found.nav_R_map @ poses.map_R_body).as_quat(canonical=True)
@@ -167,8 +187,8 @@ def _poses(registered: Mapping[str, Floats], rows: Mapping[str, int], session: S
 def _known_at(known: Known, t_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
     """Known positions (n, 3) at times (n,), and which of them are there."""
     at = np.asarray(known.t_ns, dtype=np.int64)
-    if known.nav_t_body.shape != (len(at), 3) or not np.isfinite(known.nav_t_body).all() or (np.diff(at) <= 0).any():
-        found = f"{len(at)} times and positions {known.nav_t_body.shape}"
+    if known.nav_t.shape != (len(at), 3) or not np.isfinite(known.nav_t).all() or (np.diff(at) <= 0).any():
+        found = f"{len(at)} times and positions {known.nav_t.shape}"
         raise SessionError("known positions", found, "ascending times and (k, 3) finite metres")
     if len(at) == 0:
         return np.zeros((len(t_ns), 3)), np.zeros(len(t_ns), dtype=bool)
@@ -177,4 +197,4 @@ def _known_at(known: Known, t_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np
     there = (at[right] == t_ns) | (
         (after > 0) & (after < len(at)) & (at[right] - at[left] <= round(known.longest_gap_s * NS))
     )
-    return interpolate(t_ns, at, known.nav_t_body), there
+    return interpolate(t_ns, at, known.nav_t), there

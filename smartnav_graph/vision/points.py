@@ -53,7 +53,7 @@ class Sightings:
     @cached_property
     def count(self) -> Ints:
         """Observations (n,) of each track."""
-        return self.there.sum(axis=1).astype(np.intp)
+        return np.asarray(self.there.sum(axis=1), dtype=np.intp)
 
     @cached_property
     def last(self) -> Ints:

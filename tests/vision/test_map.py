@@ -10,8 +10,8 @@ from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.errors import SessionError, SolverError
 from smartnav_graph.session import Mount, Session
-from smartnav_graph.streams import Images
-from smartnav_graph.vision.map import Known, pose_fixes
+from smartnav_graph.streams import GnssFix, Images
+from smartnav_graph.vision.map import Known, own_fixes, pose_fixes
 
 COUNT = 12
 T0_NS, STEP_NS, OFFSET_S = 10**12, 5 * 10**8, 0.02
@@ -188,7 +188,7 @@ def test_wrong_positions_are_named():
     t = truth()[0]
     for wrong in (t[:5], np.where(np.arange(3) == 1, np.nan, t)):
         with pytest.raises(SessionError, match="known positions: 12 times and positions"):
-            pose_fixes(reconstruction(), session(), known()._replace(nav_t_body=wrong))
+            pose_fixes(reconstruction(), session(), known()._replace(nav_t=wrong))
     with pytest.raises(SessionError, match="expected ascending times"):
         pose_fixes(reconstruction(), session(), known()._replace(t_ns=known().t_ns[::-1]))
 
@@ -201,10 +201,31 @@ def test_a_real_model_agrees_with_its_own_text(dataset):
     found = pose_fixes(folder / "colmap_ground_truth", recorded, where)
     assert found.counts == {"used": 12, "aligned": 12, "unknown": 0, "unregistered": 0}
     assert found.similarity.scale == pytest.approx(2.5, rel=1e-6)
-    np.testing.assert_allclose(found.fixes.enu, where.nav_t_body, atol=1e-5)
+    np.testing.assert_allclose(found.fixes.enu, where.nav_t, atol=1e-5)
     both = (Rotation.from_quat(np.roll(quat, -1, axis=1)) for quat in (found.fixes.quat, reference.quat))
     one, other = both
     assert np.degrees((one.inv() * other).magnitude()).max() < 1e-4
+
+
+def test_the_antenna_stands_beside_the_camera():
+    """Fixes of a receiver: laid on where its antenna was, told for the body."""
+    arm = (0.3, -0.8, 1.1)
+    t, R = truth()
+    at_antenna = known(t + R @ np.array(arm))
+    found = pose_fixes(reconstruction(), session(), at_antenna._replace(body_t=arm))
+    assert worst(found)[0] < 1e-6
+    assert worst(pose_fixes(reconstruction(), session(), at_antenna))[0] > 0.1
+    fixes = GnssFix(t_ns=at_antenna.t_ns, enu=at_antenna.nav_t)
+    recorded = session().replace(gnss=fixes, sensors={**session().sensors, "gnss": Mount(arm)})
+    assert worst(pose_fixes(reconstruction(), recorded, own_fixes(recorded)))[0] < 1e-6
+    with pytest.raises(SessionError, match=r"no gnss fixes to lay a map on.*--known RUN"):
+        own_fixes(session())
+
+
+def test_fixes_of_a_sensor_beside_the_body_are_refused():
+    placed = session().replace(sensors={**session().sensors, "pose_fixes": Mount((0.0, 0.1, 0.0))})
+    with pytest.raises(SessionError, match=r"places a sensor of pose fixes.*\[sensors.pose_fixes\]"):
+        pose_fixes(reconstruction(), placed, known())
 
 
 def test_two_files_of_one_name_need_their_folder():
