@@ -2,7 +2,7 @@
 
 trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
 keyframes.parquet, influence.parquet (the linear system at the solution, see `influence`), summary.json, config.toml,
-calibration.toml, report.html, run.rrd: all of them, or nothing.
+calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
 """
 
 from __future__ import annotations
@@ -205,14 +205,17 @@ def _write_views(
     run: Run, folder: Path, told: Mapping[str, Any], evaluation: Evaluation | None, report: bool, recording: bool
 ) -> None:
     from smartnav_graph.report import report_markdown, write_report
-    from smartnav_graph.rerun_log import write_recording
+    from smartnav_graph.rerun_log import write_latency, write_recording
 
     common: dict[str, Any] = {"session": recorded(run), "solution": run.solution, "summary": told}
     common |= {"evaluation": evaluation, "causal": run.causal}
     if recording:
         # a summary without its timings: equal runs give equal recordings
         steady = {key: value for key, value in told.items() if key not in UNSTEADY}
-        write_recording(folder / "run.rrd", report_markdown=report_markdown(steady, evaluation), **common)
+        markdown = report_markdown(steady, evaluation)
+        identity = write_recording(folder / "run.rrd", report_markdown=markdown, trace=run.trace, **common)
+        if run.trace is not None and run.trace.updates is not None:
+            write_latency(folder / "latency.rrd", session=run.session, trace=run.trace, identity=identity)
     if report:
         write_report(folder / "report.html", withheld=run.withheld, **common)
 

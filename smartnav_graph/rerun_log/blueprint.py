@@ -1,4 +1,4 @@
-"""The window that opens: only views that have data."""
+"""The window that opens: only views that have data, in the order in which a recording of its kind is looked at."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph import frames
 from smartnav_graph.rerun_log import signals
+from smartnav_graph.rerun_log.cameras import CameraView
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.rerun_log.spatial import Extent, nice
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
 
 Floats = NDArray[np.float64]
+Names = tuple[tuple[str, str], ...]
 
-_SIGNALS = (
+_MOTION: Names = (
+    ("Speed m/s", "/motion/speed"),
+    ("Heading, pitch, roll °", "/motion/attitude"),
+    ("Height m", "/motion/height"),
+)
+_SIGNALS: Names = (
     ("Accelerometer m/s²", "/imu/accel"),
     ("Gyroscope rad/s", "/imu/gyro"),
     ("Magnetometer µT", "/magnetometer"),
@@ -24,17 +32,43 @@ _SIGNALS = (
     ("Velocity m/s (body)", "/velocity"),
     ("Wheel speed m/s", "/wheel"),
 )
-_ACCURACY = (
-    ("Position error m, band 1σ", "/error/position"),
+_ACCURACY: Names = (
+    ("Position error m, bands 1σ 3σ", "/error/position"),
     ("Rotation error °", "/error/rotation"),
     ("Position σ m", "/sigma/position"),
     ("Heading σ °", "/sigma/heading"),
 )
-_BIASES = (("Accelerometer bias m/s², band 1σ", "/bias/accel"), ("Gyroscope bias rad/s, band 1σ", "/bias/gyro"))
-
+_FOUND: Names = (
+    ("Accelerometer bias m/s², bands 1σ 3σ", "/bias/accel"),
+    ("Gyroscope bias rad/s, bands 1σ 3σ", "/bias/gyro"),
+)
+_UPDATES: Names = (
+    ("Updates: latency ms, states", "/update/effort"),
+    ("Correction of the past m", "/update/correction"),
+    ("Rejected rows by update", "/update/rejected"),
+)
+_PAIRS: Names = (("Matches of image pairs", "/pairs/matches"),)
 
 # The viewer's vertical opening angle, a picture 1.6 times as wide as high, and the share of it that is filled.
 OPENING_DEG, ASPECT, FILLED = 55.0, 1.6, 0.85
+# A scene too small for a map, m.
+SMALL = 50.0
+# How near the body is looked at, as a share of the scene.
+NEAR = 0.25
+
+
+def kind_of(recorder: Recorder, session: Session, solution: Solution | None) -> str:
+    """What a recording is looked at for: ``calibration`` (signals without a path), ``session`` (not solved yet),
+    ``vision``, ``car`` (under the sky) or ``indoor``."""
+    if solution is None:
+        return "calibration" if not recorder.has("/world") else "session"
+    if recorder.has("/pairs") or any("/image" in path for path in recorder.paths):
+        return "vision"
+    return "car" if session.gnss is not None else "indoor"
+
+
+# The signal that each kind shows first.
+_FIRST = {"car": "/motion/speed", "indoor": "/motion/height", "vision": "/motion/attitude"}
 
 
 def build(
@@ -43,12 +77,16 @@ def build(
     solution: Solution | None,
     extent: Extent | None,
     factor: float,
+    seen: list[CameraView],
 ) -> Any:
-    """Left the path with report, map and camera; right the signals. `factor` magnifies the ellipsoids of the path."""
+    """Left the path with graph, report, map and cameras; right what is drawn against time. `factor` magnifies the
+    ellipsoids of the path."""
     import rerun.blueprint as rrb
 
-    left = _stack([_tabs(_scenes(recorder, extent, factor)), _row(_flat_views(recorder, session, extent))], [3, 2])
-    right = _right(recorder, solution)
+    kind = kind_of(recorder, session, solution)
+    flat = _row(_flat_views(recorder, session, extent, seen))
+    left = _stack([_tabs(_scenes(recorder, solution, extent, factor)), flat], [1, 1] if kind == "vision" else [3, 2])
+    right = _right(recorder, solution, kind)
     sides = [side for side in (left, right) if side is not None]
     return rrb.Blueprint(
         rrb.Horizontal(*sides, column_shares=[3, 2][: len(sides)]),
@@ -85,7 +123,7 @@ def _row(views: list[Any]) -> Any:
     return rrb.Horizontal(*views)
 
 
-def _scenes(recorder: Recorder, extent: Extent | None, factor: float) -> list[Any]:
+def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None, factor: float) -> list[Any]:
     import rerun.blueprint as rrb
 
     views: list[Any] = []
@@ -94,11 +132,30 @@ def _scenes(recorder: Recorder, extent: Extent | None, factor: float) -> list[An
         if recorder.has("/world/est/covariances"):
             name += f", 3σ ellipsoids ×{factor:g}"
         views.append(_world(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
-    if recorder.has("/report"):
-        views.append(rrb.TextDocumentView(name="Report", origin="/report"))
-    if recorder.has("/legend"):
-        views.append(rrb.TextDocumentView(name="Legend", origin="/legend"))
+        if solution is not None and recorder.has("/world/est/body"):
+            views.append(_ride(solution, extent))
+    if recorder.has("/graph"):
+        (left, top), (right, bottom) = recorder.bounds["/graph"]
+        bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
+        views.append(rrb.GraphView(name="Factor graph", origin="/graph", visual_bounds=bounds))
+    documents = (("Report", "/report"), ("States of the session", "/states"), ("Legend", "/legend"))
+    views += [rrb.TextDocumentView(name=name, origin=path) for name, path in documents if recorder.has(path)]
     return views
+
+
+def _ride(solution: Solution, extent: Extent) -> Any:
+    """The scene as it passes the body, from behind and above it: with camera, velocity and true uncertainty."""
+    import rerun.blueprint as rrb
+
+    ahead, _, up = frames.body_R_vehicle(solution.forward, solution.up).T
+    near = NEAR * extent.size
+    return rrb.Spatial3DView(
+        name="Behind the body",
+        origin="/world/est/body",
+        contents=["/world/**", "- /world/est/covariances"],
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(position=near * (0.5 * up - ahead), look_target=near * (0.5 * ahead), eye_up=up),
+    )
 
 
 def _world(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
@@ -136,39 +193,43 @@ def eye_position(extent: Extent, direction: Floats, up: Floats) -> Floats:
     return np.asarray(extent.centre - ahead * max(distance, 0.5 * extent.size))
 
 
-def _flat_views(recorder: Recorder, session: Session, extent: Extent | None) -> list[Any]:
-    import rerun.blueprint as rrb
-
+def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, seen: list[CameraView]) -> list[Any]:
     views: list[Any] = []
-    if recorder.has("/geo") and extent is not None:
+    if recorder.has("/geo") and extent is not None and extent.size > SMALL:
         views.append(_map(session, extent))
     elif recorder.has("/world") and extent is not None:
         views.append(_world("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
-    cameras = sorted({path.split("/")[2] for path in recorder.paths if path.startswith("/camera/")})
-    for camera in cameras:
-        origin = f"/camera/{camera}"
-        views.append(rrb.Spatial2DView(name=f"Camera {camera}", origin=origin, contents=[f"{origin}/**"]))
-    if recorder.has("/tracks") and session.tracks is not None:
-        views.append(_tracks(session.tracks.xy_n))
+    for view in seen:
+        if recorder.has(view.image) or (view.camera is not None and recorder.has(view.points)):
+            views.append(_camera(view))
+        if view.camera is None and recorder.has(view.origin):
+            views.append(_normalised(view, session))
     return views
 
 
-def _tracks(xy_n: Floats) -> Any:
-    """Normalised image coordinates, with the last half second as a trail."""
-    import rerun as rr
+def _camera(view: CameraView) -> Any:
+    """The image of one camera, in pixels."""
     import rerun.blueprint as rrb
 
-    low, high = xy_n.min(axis=0), xy_n.max(axis=0)
+    bounds = None
+    if view.camera is not None:
+        bounds = rrb.VisualBounds2D(x_range=[0, view.camera.width], y_range=[0, view.camera.height])
+    contents = [f"{view.root}/**"]
+    return rrb.Spatial2DView(name=f"Camera {view.name}", origin=view.root, contents=contents, visual_bounds=bounds)
+
+
+def _normalised(view: CameraView, session: Session) -> Any:
+    """Points of a camera without calibration, in normalised image coordinates."""
+    import rerun.blueprint as rrb
+
+    points = [] if session.tracks is None else [session.tracks.xy_n]
+    points += [] if session.matches is None else [session.matches.xy0_n, session.matches.xy1_n]
+    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
     (left, top), (right, bottom) = low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3
-    cursor = rr.TimeRangeBoundary.cursor_relative
     return rrb.Spatial2DView(
-        name="Tracks (normalised)",
-        origin="/tracks",
+        name=f"Points of {view.name} (normalised)",
+        origin=view.origin,
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
-        time_ranges=[
-            rrb.VisibleTimeRange(timeline, start=cursor(seconds=-0.5), end=cursor(seconds=0.0))
-            for timeline in ("elapsed", "utc", "device")
-        ],
     )
 
 
@@ -184,31 +245,42 @@ def _map(session: Session, extent: Extent) -> Any:
     return rrb.MapView(name="Map", origin="/geo", zoom=zoom, background=rrb.MapProvider.OpenStreetMap)
 
 
-def _right(recorder: Recorder, solution: Solution | None) -> Any:
+def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
     import rerun.blueprint as rrb
 
-    def series(names: tuple[tuple[str, str], ...]) -> list[Any]:
-        return [_series(name, [path], limits=recorder.limits.get(path)) for name, path in names if recorder.has(path)]
+    def series(names: Names, first: str = "") -> list[Any]:
+        there = [(name, path) for name, path in names if recorder.has(path)]
+        there.sort(key=lambda item: item[1] != first)
+        return [_series(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
 
     raw = series(_SIGNALS)
     # Without a solution there is room to show every signal at once.
-    signals_part = _tabs(raw) if solution is not None else _stack(raw, [2.0] * len(raw))
+    shown = _stack(raw, [2.0] * len(raw)) if solution is None else _tabs(series(_MOTION, _FIRST.get(kind, "")) + raw)
     states = (
         rrb.StateTimelineView(name="States", origin="/status", time_view=_whole()) if recorder.has("/status") else None
     )
     log = rrb.TextLogView(name="Log", origin="/log", columns=_log_columns()) if recorder.has("/log") else None
     count = 2.0 if solution is not None else 2.0 * max(1, len(raw))
-    return _stack(
-        [
-            signals_part,
-            _tabs(series(_ACCURACY)),
-            _tabs(series(_BIASES)),
-            _tabs(_residuals(solution)),
-            states,
-            log,
-        ],
-        [count, 2.0, 2.0, 2.0, 1.9, 1.9],
-    )
+    parts = [
+        shown,
+        _tabs(series(_ACCURACY)),
+        _tabs(series(_FOUND) + series(_clocks(recorder))),
+        _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(solution)]),
+        states,
+        log,
+    ]
+    statuses = sum(path.startswith("/status/") for path in recorder.paths)
+    return _stack(parts, [count, 2.0, 2.0, 2.0, 0.8 + 0.5 * statuses, 1.8])
+
+
+def _contents(path: str) -> list[str]:
+    # how long an update took, where that recording is there too, beside what it did
+    return [f"{path}/**", "/update/latency"] if path == "/update/effort" else [f"{path}/**"]
+
+
+def _clocks(recorder: Recorder) -> Names:
+    sensors = sorted({path.split("/")[2] for path in recorder.paths if path.startswith("/clock/")})
+    return tuple((f"Clock offset of {sensor} s, bands 1σ 3σ", f"/clock/{sensor}") for sensor in sensors)
 
 
 def _residuals(solution: Solution | None) -> list[Any]:

@@ -20,3 +20,36 @@ TRACKS = [
     *([230, 80, 80], [240, 150, 60], [240, 210, 70], [170, 210, 80], [90, 200, 100], [70, 200, 170]),
     *([80, 200, 230], [90, 150, 255], [140, 120, 250], [200, 110, 240], [240, 110, 200], [200, 200, 200]),
 ]
+CAMERA = [230, 230, 230]
+WINDOW = [255, 255, 255]
+# States of the graph, by letter, and factors, by what they rest on.
+STATES = {"X": [90, 160, 255], "V": [120, 230, 120], "B": [255, 170, 60]}
+_BUILDERS = {
+    "imu": [235, 80, 80],
+    "imu_bias": [200, 110, 70],
+    "gnss": FIX,
+    "control": CONTROL,
+    "pose_fixes": POSE_FIX,
+    "coplanarity": [240, 225, 90],
+    "prior": [200, 200, 200],
+}
+MATCH, OUTLIER, UNUSED, NEUTRAL = [90, 220, 120], [255, 70, 70], [240, 180, 70], [150, 200, 255]
+
+
+def of_builder(name: str) -> list[int]:
+    """The colour of a builder's factors."""
+    return _BUILDERS.get(name, [190, 130, 255])
+
+
+GOOD, POOR, BAD, STILL = [60, 140, 80], [200, 130, 40], [210, 60, 60], [70, 110, 190]
+_STATUS = {
+    **dict.fromkeys(("recorded", "fix", "moving", "accepted", "in use"), GOOD),
+    **dict.fromkeys(("bridged", "no baseline to speak of", "too few matches"), POOR),
+    **dict.fromkeys(("missing", "outage", "rejected", "contradicts the turn or the way"), BAD),
+    "still": STILL,
+}
+
+
+def of_status(value: str) -> list[int]:
+    """The colour of a state on the time line."""
+    return _STATUS.get(value, QUIET)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from smartnav_graph.rerun_log import colours
+from smartnav_graph.trace import window_of
 
 Times = NDArray[np.int64]
 
@@ -40,11 +43,13 @@ class Clock:
 
     `elapsed` counts from the session's time zero. `utc` exists where the session's clock is a date (unix, gps), else
     `device` holds the raw reading. A "gps" or "unix" clock that reads before the year 2000 counts seconds of a week
-    or a day: it is no date.
+    or a day: it is no date. `keyframe` numbers the window between keyframes (`keyframe_ns` (n,)) that a stamp lies in
+    by the keyframe at its end; without keyframes there is no such time line.
     """
 
     t0_ns: int
     epoch: str = "unknown"
+    keyframe_ns: Times = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
     def is_date(self) -> bool:
@@ -55,7 +60,7 @@ class Clock:
         """Unix nanoseconds of stamps of a unix or gps clock."""
         return utc_from_gps(t_ns) if self.epoch == "gps" else t_ns
 
-    def columns(self, t_ns: ArrayLike, keyframe: ArrayLike | None = None) -> list[Any]:
+    def columns(self, t_ns: ArrayLike) -> list[Any]:
         """Index columns for rows at `t_ns` (n,)."""
         import rerun as rr
 
@@ -65,8 +70,8 @@ class Clock:
             columns.append(rr.TimeColumn("utc", timestamp=self.utc(t).astype("datetime64[ns]")))
         else:
             columns.append(rr.TimeColumn("device", duration=t.astype("timedelta64[ns]")))
-        if keyframe is not None:
-            columns.append(rr.TimeColumn("keyframe", sequence=np.asarray(keyframe, dtype=np.int64)))
+        if len(self.keyframe_ns):
+            columns.append(rr.TimeColumn("keyframe", sequence=window_of(t, self.keyframe_ns)))
         return columns
 
 
@@ -74,13 +79,15 @@ class Clock:
 class Recorder:
     """Writes columns and static data, and remembers the entities, so that the blueprint shows only what is there.
 
-    `limits` keeps a plot's value range where the viewer's own choice would cut off the bands.
+    `limits` keeps a plot's value range where the viewer's own choice would cut off the bands, `bounds` the lower and
+    upper corner (2, 2) of a flat drawing.
     """
 
     stream: Any
     clock: Clock
     paths: set[str] = field(default_factory=set)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    bounds: dict[str, NDArray[np.floating[Any]]] = field(default_factory=dict)
 
     def static(self, path: str, *archetypes: Any) -> None:
         """Data that holds at all times."""
@@ -91,11 +98,22 @@ class Recorder:
         """Static colours and names of an entity whose data are rows."""
         self.stream.log(path, archetype, static=True, strict=True)
 
-    def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[Any], keyframe: ArrayLike | None = None) -> None:
+    def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[Any]) -> None:
         """One row a time stamp; nothing is written without rows."""
         if len(np.asarray(t_ns)):
-            self.stream.send_columns(path, self.clock.columns(t_ns, keyframe), columns, strict=True)
+            self.stream.send_columns(path, self.clock.columns(t_ns), columns, strict=True)
             self.paths.add(path)
+
+    def states(self, path: str, t_ns: ArrayLike, states: Sequence[str]) -> None:
+        """What state something is in from each stamp on; only changes are written."""
+        import rerun as rr
+
+        t = np.asarray(t_ns, dtype=np.int64)
+        new = [i for i, state in enumerate(states) if i == 0 or state != states[i - 1]]
+        self.rows(path, t[new], rr.StateChange.columns(state=[states[i] for i in new]))
+        values = sorted(set(states))
+        colors = [colours.of_status(value) for value in values]
+        self.style(path, rr.StateConfiguration(values=values, labels=values, colors=colors))
 
     def name(self, device: str, identity: str) -> None:
         """What the viewer lists the recording as: device, date where the clock is one, and a bit of the identity."""
@@ -110,6 +128,15 @@ class Recorder:
         if len(t) and path in self.paths:
             cleared = rr.Clear.columns(is_recursive=np.zeros(len(t), dtype=bool))
             self.stream.send_columns(path, self.clock.columns(t), cleared, strict=True)
+
+    def widen(self, path: str, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Let a plot reach from `low` to `high`, but for their extreme half percent."""
+        if not (np.isfinite(low).any() and np.isfinite(high).any()):
+            return
+        bottom, top = float(np.nanpercentile(low, 0.5)), float(np.nanpercentile(high, 99.5))
+        margin = 0.05 * (top - bottom)
+        if margin > 0:
+            self.limits[path] = (bottom - margin, top + margin)
 
     def has(self, prefix: str) -> bool:
         """Whether this entity, or one below it, holds data."""
@@ -174,7 +201,11 @@ def _feed(digest: Any, part: Any) -> None:
         for key, value in part.items():
             _feed(digest, str(key))
             _feed(digest, value)
-    elif isinstance(part, list | tuple | np.ndarray):
+    elif isinstance(part, np.ndarray):
+        texts, place = np.unique(part.astype(str), return_inverse=True)
+        _feed(digest, texts.tolist())
+        _feed(digest, place)
+    elif isinstance(part, list | tuple):
         digest.update(f"[{len(part)}]".encode())
         for item in part:
             _feed(digest, item)

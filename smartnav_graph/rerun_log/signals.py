@@ -37,21 +37,14 @@ def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
             recorder.clear(path, stops(stream.t_ns, end_ns))
 
 
-def _log_lines(
-    recorder: Recorder,
-    path: str,
-    t_ns: NDArray[np.int64],
-    values: Floats,
-    names: list[str],
-    keyframe: NDArray[Any] | None = None,
-) -> None:
+def _log_lines(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, names: list[str]) -> None:
     import rerun as rr
 
-    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values), keyframe)
+    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
     recorder.style(path, rr.SeriesLines(colors=colours.AXES[: len(names)], names=names, widths=[1.0] * len(names)))
 
 
-def _log_bands(
+def log_bands(
     recorder: Recorder,
     path: str,
     t_ns: NDArray[np.int64],
@@ -59,31 +52,50 @@ def _log_bands(
     sigmas: Floats,
     names: list[str],
     unit: str,
-    keyframe: NDArray[Any] | None,
+    colors: list[list[int]] | None = None,
 ) -> None:
-    """Lines with bands of one sigma."""
+    """Lines with bands of one sigma, and at `path`/three_sigma of three: values and sigmas (n, k)."""
     import rerun as rr
 
-    columns = rr.Measurements.columns(values=values, variances=sigmas**2)
-    recorder.rows(path, t_ns, columns, keyframe)
-    style = rr.Measurements.from_fields(names=names, units=[unit] * len(names), colors=colours.AXES[: len(names)])
-    recorder.style(path, style)
-    low, high = np.nanpercentile(values - sigmas, 0.5), np.nanpercentile(values + sigmas, 99.5)
-    if np.isfinite([low, high]).all() and high > low:
-        margin = 0.05 * (high - low)
-        recorder.limits[path] = (float(low - margin), float(high + margin))
+    colors = colors or colours.AXES[: len(names)]
+    for where, times, alpha in ((path, 1.0, 255), (f"{path}/three_sigma", 3.0, 120)):
+        columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
+        recorder.rows(where, t_ns, columns)
+        style = rr.Measurements.from_fields(
+            names=names,
+            units=[unit] * len(names),
+            colors=[[*color, alpha] for color in colors],
+            widths=[1.5 if times == 1.0 else 0.0] * len(names),
+        )
+        recorder.style(where, style)
+    recorder.widen(path, values - 3.0 * sigmas, values + 3.0 * sigmas)
 
 
 def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -> None:
-    """Biases with their bands; the error with its band where a reference is known, else the sigma itself."""
-    sigma, t, rows = solution.sigmas, solution.t_ns, np.arange(len(solution))
+    """Biases with their bands; the error with its bands where a reference is known, else the sigma itself."""
+    sigma, t = solution.sigmas, solution.t_ns
     axes = ["x", "y", "z"]
-    _log_bands(recorder, "/bias/accel", t, solution.accel_bias, sigma[:, ACCEL_BIAS], axes, "m/s²", rows)
-    _log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s", rows)
-    _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"], rows)
-    _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg, ["heading"], rows)
+    log_bands(recorder, "/bias/accel", t, solution.accel_bias, sigma[:, ACCEL_BIAS], axes, "m/s²")
+    log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s")
+    _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"])
+    _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg[:, None], ["heading"])
     if evaluation is not None:
         _log_error(recorder, evaluation)
+
+
+def log_motion(recorder: Recorder, solution: Solution) -> None:
+    """Speed, height, heading, pitch and roll: what the path is made of."""
+    import rerun as rr
+
+    t, angles = solution.t_ns, solution.heading_pitch_roll_deg
+    speed = np.linalg.norm(solution.nav_v_body, axis=1)[:, None]
+    _log_lines(recorder, "/motion/speed", t, speed, ["speed"])
+    _log_lines(recorder, "/motion/height", t, solution.nav_t_body[:, 2:], ["up"])
+    _log_lines(recorder, "/motion/attitude/tilt", t, angles[:, 1:], ["pitch", "roll"])
+    # points: a line would run through the whole picture where north is passed
+    recorder.rows("/motion/attitude/heading", t, rr.Scalars.columns(scalars=angles[:, :1]))
+    style = rr.SeriesPoints(colors=colours.AXES[2], names="heading", markers="circle", marker_sizes=1.5)
+    recorder.style("/motion/attitude/heading", style)
 
 
 def _log_error(recorder: Recorder, evaluation: Any) -> None:
@@ -92,10 +104,10 @@ def _log_error(recorder: Recorder, evaluation: Any) -> None:
     if sigma is None:
         _log_lines(recorder, "/error/position", t, error, names)
     else:
-        _log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m", None)
+        log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m")
     rotation = getattr(evaluation, "rotation_error_deg", None)
     if rotation is not None and np.isfinite(rotation).any():
-        _log_lines(recorder, "/error/rotation", t, np.asarray(rotation), ["rotation"])
+        _log_lines(recorder, "/error/rotation", t, np.asarray(rotation)[:, None], ["rotation"])
 
 
 def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:

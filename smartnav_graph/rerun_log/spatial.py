@@ -144,6 +144,27 @@ class Scene:
             lat_lon = self.session.frame.lla_from_nav(enu[good])[:, :2]
             self.recorder.static(f"/geo/{path}", rr.GeoPoints(lat_lon=lat_lon, colors=colour, radii=radius))
 
+    def ellipsoids(
+        self, path: str, t_ns: NDArray[np.int64], enu: Floats, covariance: Floats, colour: list[int]
+    ) -> None:
+        """The ellipsoid of the moment, at true size, at /world/<path>."""
+        import rerun as rr
+
+        good = _known(covariance) & np.isfinite(enu).all(axis=1)
+        half, quaternion = ellipsoids(covariance[good])
+        columns = rr.Ellipsoids3D.columns(
+            centers=self.local(enu[good]), half_sizes=ELLIPSOID_SIGMAS * half, quaternions=quaternion
+        )
+        self.recorder.rows(f"/world/{path}", t_ns[good], columns)
+        style = rr.Ellipsoids3D.from_fields(colors=[*colour, 110], fill_mode="solid")
+        self.recorder.style(f"/world/{path}", style)
+
+
+def _known(covariance: Floats) -> NDArray[np.bool_]:
+    """Which covariances (n, 3, 3) have an ellipsoid."""
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    return np.asarray(finite & (np.trace(covariance, axis1=1, axis2=2) > 0))
+
 
 def log_solution(scene: Scene, solution: Solution) -> float:
     """Path, moving body with axes and velocity, covariance ellipsoids; the magnification of those along the path."""
@@ -162,15 +183,15 @@ def _log_body(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> None:
     recorder, t = scene.recorder, solution.t_ns[rows]
     at = scene.local(solution.nav_t_body[rows])
     quaternion = Rotation.from_matrix(solution.nav_R_body[rows]).as_quat(canonical=True)
-    recorder.rows("/world/est/body", t, rr.Transform3D.columns(translation=at, quaternion=quaternion), rows)
+    recorder.rows("/world/est/body", t, rr.Transform3D.columns(translation=at, quaternion=quaternion))
     recorder.style("/world/est/body", rr.TransformAxes3D(0.04 * scene.extent.size))
     velocity = np.nan_to_num(solution.nav_v_body[rows])
-    recorder.rows("/world/est/velocity", t, rr.Arrows3D.columns(origins=at, vectors=velocity), rows)
+    recorder.rows("/world/est/velocity", t, rr.Arrows3D.columns(origins=at, vectors=velocity))
     style = rr.Arrows3D.from_fields(colors=colours.VELOCITY, radii=rr.Radius.ui_points(2.5))
     recorder.style("/world/est/velocity", style)
     if scene.session.frame is not None:
         lat_lon = scene.session.frame.lla_from_nav(solution.nav_t_body[rows])[:, :2]
-        recorder.rows("/geo/body", t, rr.GeoPoints.columns(positions=lat_lon), rows)
+        recorder.rows("/geo/body", t, rr.GeoPoints.columns(positions=lat_lon))
         recorder.style("/geo/body", rr.GeoPoints.from_fields(colors=colours.BODY, radii=rr.Radius.ui_points(8.0)))
 
 
@@ -179,24 +200,20 @@ def _log_covariance(scene: Scene, solution: Solution, rows: NDArray[np.intp]) ->
     import rerun as rr
 
     covariance = solution.covariance[rows][:, POS, POS]
-    known = np.isfinite(covariance).all(axis=(1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
+    scene.ellipsoids("est/covariance", solution.t_ns[rows], solution.nav_t_body[rows], covariance, colours.COVARIANCE)
+    known = _known(covariance)
     rows, covariance = rows[known], covariance[known]
     if not len(rows):
         return 1.0
-    half, quaternion = ellipsoids(covariance)
-    half, at = ELLIPSOID_SIGMAS * half, scene.local(solution.nav_t_body[rows])
-    columns = rr.Ellipsoids3D.columns(centers=at, half_sizes=half, quaternions=quaternion)
-    scene.recorder.rows("/world/est/covariance", solution.t_ns[rows], columns, rows)
-    style = rr.Ellipsoids3D.from_fields(colors=[*colours.COVARIANCE, 110], fill_mode="solid")
-    scene.recorder.style("/world/est/covariance", style)
     some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_ELLIPSOIDS)).astype(int))
     factor = magnification(covariance, scene.extent.size)
+    half, quaternion = ellipsoids(covariance[some])
     scene.recorder.static(
         "/world/est/covariances",
         rr.Ellipsoids3D(
-            centers=at[some],
-            half_sizes=factor * half[some],
-            quaternions=quaternion[some],
+            centers=scene.local(solution.nav_t_body[rows[some]]),
+            half_sizes=factor * ELLIPSOID_SIGMAS * half,
+            quaternions=quaternion,
             colors=[*colours.COVARIANCE, 150],
             line_radii=rr.Radius.ui_points(0.5),
             fill_mode="majorwireframe",

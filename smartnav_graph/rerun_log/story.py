@@ -7,26 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from smartnav_graph.rerun_log import colours
 from smartnav_graph.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.session import Session
 from smartnav_graph.timebase import Gap, seconds_since
 
 MOST_LINES_A_KIND = 200
-
-GOOD, POOR, BAD = [60, 140, 80], [220, 150, 40], [210, 60, 60]
-_STATES = {
-    "recorded": GOOD,
-    "missing": BAD,
-    "bridged": POOR,
-    "fix": GOOD,
-    "outage": BAD,
-    "moving": GOOD,
-    "still": [70, 110, 190],
-    "accepted": GOOD,
-    "rejected": BAD,
-}
 
 _LEGEND = {
     "/world/est/path": "**blue line**, the smoothed path",
@@ -35,6 +21,10 @@ _LEGEND = {
     "/world/est/covariance": "**orange, filled**, 3σ ellipsoid of the position at the chosen time, true size",
     "/world/est/covariances": "**orange, wire**, 3σ ellipsoids along the path, magnified as the view's name says",
     "/world/causal/path": "**yellow line**, the estimate when each keyframe became known",
+    "/world/causal/now": "**yellow point**, the estimate that the chosen time had of itself",
+    "/world/causal/covariance": "**yellow, filled**, its 3σ ellipsoid, true size",
+    "/world/causal/window": "**white line**, the window: what the update of the chosen time could still correct, "
+    "as it left it",
     "/world/reference/path": "**thin light line**, the reference",
     "/world/gnss/fixes": "**green points**, GNSS fixes; large: the latest one",
     "/world/gnss/withheld": "**violet points**, fixes that are not in the solution (withheld, or outside it)",
@@ -67,13 +57,7 @@ def _rejections(session: Session, events: Events) -> list[Gap]:
 
 
 def _log_state(recorder: Recorder, path: str, events: Events, spans: list[Gap], between: str) -> None:
-    import rerun as rr
-
-    times, states = switches(events.start_ns, spans, between)
-    recorder.rows(path, times, rr.StateChange.columns(state=states))
-    values = sorted(set(states))
-    colors = [_STATES.get(value, colours.QUIET) for value in values]
-    recorder.style(path, rr.StateConfiguration(values=values, labels=values, colors=colors))
+    recorder.states(path, *switches(events.start_ns, spans, between))
 
 
 def log_lines(

@@ -15,26 +15,27 @@ from smartnav_graph.session import load
 
 
 def recordings(paths: Iterable[str | Path], scratch: Path) -> list[Path]:
-    """A .rrd file for each recording, run folder (run.rrd inside) or session folder (written to `scratch`).
+    """The .rrd files of each recording, run folder (run.rrd inside, latency.rrd of a replay) or session folder (written
+    to `scratch`).
 
     Raises
     ------
     SessionError
         A path is none of these.
     """
-    return [_recording(Path(path), scratch / f"{number}.rrd") for number, path in enumerate(paths)]
+    return [file for number, path in enumerate(paths) for file in _recordings(Path(path), scratch / f"{number}.rrd")]
 
 
-def _recording(path: Path, new: Path) -> Path:
+def _recordings(path: Path, new: Path) -> list[Path]:
     from smartnav_graph.rerun_log import write_recording
 
     if path.is_file() and path.suffix == ".rrd":
-        return path
+        return [path]
     if (path / "run.rrd").is_file():
-        return path / "run.rrd"
+        return [file for name in ("run.rrd", "latency.rrd") if (file := path / name).is_file()]
     if (path / "session.toml").is_file():
         write_recording(new, session=load(path), solution=None)
-        return new
+        return [new]
     found = "does not exist" if not path.exists() else "holds no run.rrd and no session.toml"
     raise SessionError(path, found, "a .rrd file, a run folder or a session folder", "check the path")
 

@@ -1,0 +1,64 @@
+"""What is drawn against time."""
+
+from __future__ import annotations
+
+import numpy as np
+from recordings import (
+    EVALUATION,
+    make_session,
+    make_solution,
+)
+
+from smartnav_graph.rerun_log import signals
+from smartnav_graph.solution import POS, Residuals
+
+
+def test_biases_and_errors_carry_their_variances(recording):
+    solution = make_solution()
+    np.testing.assert_array_equal(recording.values("/bias/accel", "Measurements:values"), solution.accel_bias)
+    variances = recording.values("/bias/gyro", "Measurements:variances")
+    np.testing.assert_allclose(variances, solution.sigmas[:, 12:15] ** 2, rtol=1e-12)
+    np.testing.assert_array_equal(recording.values("/error/position", "Measurements:values"), EVALUATION.error_enu_m)
+    variances = recording.values("/error/position", "Measurements:variances")
+    np.testing.assert_allclose(variances, EVALUATION.sigma_enu**2, rtol=1e-12)
+    for path, sigma in (("/bias/accel", solution.sigmas[:, 9:12]), ("/error/position", EVALUATION.sigma_enu)):
+        wide = recording.values(f"{path}/three_sigma", "Measurements:variances")
+        np.testing.assert_allclose(np.sqrt(wide), 3 * sigma, rtol=1e-12)
+        same = recording.values(f"{path}/three_sigma", "Measurements:values")
+        np.testing.assert_array_equal(same, recording.values(path, "Measurements:values"))
+    np.testing.assert_array_equal(recording.values("/sigma/position", "Scalars:scalars"), solution.sigmas[:, POS])
+
+
+def test_inertial_samples_are_all_there_and_end_where_data_stop(recording):
+    imu = make_session().imu
+    np.testing.assert_array_equal(recording.values("/imu/accel", "Scalars:scalars"), imu.accel)
+    ends = recording.index("/imu/accel", "Clear:is_recursive", "elapsed")
+    assert ends.tolist() == [25_000_000_000]  # one period after the last sample before the gap
+
+
+def test_many_residuals_of_one_time_stay_apart():
+    rows = Residuals(
+        t_ns=np.array([5, 5, 5, 7, 7]),
+        sensor=np.array(["cam"] * 5, dtype=object),
+        axis=np.array([0, 0, 1, 0, 1]),
+        whitened=np.array([1.0, 2.0, 3.0, 4.0, 5.0]),
+        weight=np.ones(5),
+        used=np.ones(5, dtype=bool),
+    )
+    t, table = signals.residual_rows(rows, "cam", used=True)
+    assert t.tolist() == [5, 5, 7]
+    np.testing.assert_array_equal(table, [[1.0, 3.0], [2.0, np.nan], [4.0, 5.0]])
+
+
+def test_motion_is_the_solution(recording):
+    solution = make_solution()
+    angles = solution.heading_pitch_roll_deg
+    shown = np.concatenate(
+        [
+            recording.values(path, "Scalars:scalars")
+            for path in ("/motion/attitude/heading", "/motion/attitude/tilt", "/motion/height", "/motion/speed")
+        ],
+        axis=1,
+    )
+    speed = np.linalg.norm(solution.nav_v_body, axis=1)
+    np.testing.assert_array_equal(shown, np.column_stack([angles, solution.nav_t_body[:, 2], speed]))

@@ -1,0 +1,71 @@
+"""States on the time line, the log, the legend."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from recordings import (
+    OUTAGE,
+    REJECTED_ROWS,
+    make_session,
+    make_solution,
+)
+
+from smartnav_graph.rerun_log import events
+from smartnav_graph.solution import Residuals
+from smartnav_graph.timebase import NS, Gap
+
+
+def test_legend_names_what_is_drawn_and_nothing_else(recording):
+    legend = recording.rows("/legend", "TextDocument:text", static=True)[0][0]
+    named = {line.split("]")[0][3:] for line in legend.splitlines() if line.startswith("* [")}
+    assert named < recording.paths
+    drawn = {path for path in recording.paths if path.startswith("/world/")} - {"/world/gnss/current"}
+    assert named == drawn
+
+
+def test_states_switch_at_gaps_outages_and_standstills(recording):
+    component = "StateChange:state"
+    assert recording.texts("/status/gnss", component) == ["fix", "outage", "fix"]
+    times = recording.index("/status/gnss", component, "elapsed") / NS
+    np.testing.assert_allclose(times, [0, OUTAGE[0] - 1, OUTAGE[1]])
+    assert recording.texts("/status/imu", component) == ["recorded", "missing", "recorded"]
+    np.testing.assert_allclose(recording.index("/status/imu", component, "elapsed") / NS, [0, 24.98, 26.5])
+    assert recording.texts("/status/motion", component) == ["still", "moving"]
+    gate = recording.index("/status/gnss_gate", component, "elapsed") / NS
+    assert gate[1] == make_session().seconds(make_session().gnss.t_ns)[REJECTED_ROWS[0]]
+
+
+def test_log_tells_warnings_initialisation_gaps_and_rejections_in_order(recording):
+    texts = recording.texts("/log", "TextLog:text")
+    times = recording.index("/log", "TextLog:text", "elapsed")
+    assert (np.diff(times) >= 0).all()
+    assert "gnss: sigmas missing" in texts
+    assert "initialised: mode dynamic, heading_deg 12.5" in texts
+    assert times[texts.index("imu: missing for 1.52 s")] == 24_980_000_000
+    assert times[texts.index("gnss: fix rejected at 7.00 s")] == 7 * NS
+    assert times[texts.index("gnss: no fix used for 9.0 s")] == (OUTAGE[0] - 1) * NS
+
+
+def test_fixes_without_residual_are_withheld_and_a_time_offset_does_not_confuse():
+    solution = make_solution()
+    session = make_session()
+    kept = np.isin(solution.residuals.t_ns, session.gnss.t_ns[::2])
+    shifted = {f.name: getattr(solution.residuals, f.name)[kept] for f in dataclasses.fields(Residuals)}
+    shifted["t_ns"] = shifted["t_ns"] + 60_000_000  # the receiver's clock 0.06 s off
+    use = events.fix_use(session.gnss, make_solution(residuals=Residuals(**shifted)))
+    expected = np.where(np.arange(len(session.gnss)) % 2 == 0, events.USED, events.WITHHELD)
+    expected[[row for row in REJECTED_ROWS if row % 2 == 0]] = events.REJECTED
+    np.testing.assert_array_equal(use, expected)
+
+
+def test_states_between_touching_spans():
+    t, states = events.switches(0, [Gap(0, 5, "still"), Gap(10, 20, "a"), Gap(20, 30, "b")], "moving")
+    assert list(zip(t.tolist(), states, strict=True)) == [
+        (0, "still"),
+        (5, "moving"),
+        (10, "a"),
+        (20, "b"),
+        (30, "moving"),
+    ]

@@ -1,0 +1,45 @@
+"""Opening recordings, runs and sessions."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from recordings import (
+    make_session,
+)
+
+from smartnav_graph import session as sessions
+from smartnav_graph.errors import SessionError, SmartnavError
+from smartnav_graph.rerun_log import viewer
+
+
+def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):
+    sessions.save(make_session(), tmp_path / "session")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.rrd").write_bytes(b"")
+    opened = []
+
+    def run(command, check):
+        opened.append(command)
+        assert all(viewer.Path(file).is_file() for file in command[1:] if file.endswith(".rrd"))
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(viewer.subprocess, "run", run)
+    monkeypatch.setenv("DISPLAY", ":0")
+    viewer.view([tmp_path / "session", tmp_path / "run"])
+    assert [file.rsplit("/", 1)[-1] for file in opened[0][1:]] == ["--bind", "127.0.0.1", "0.rrd", "run.rrd"]
+    viewer.view([tmp_path / "run"], web=True)
+    assert "--web-viewer" in opened[1]
+
+
+def test_view_says_what_is_wrong(tmp_path, monkeypatch):
+    with pytest.raises(SessionError, match=r"absent: does not exist; expected a \.rrd file, a run folder or a session"):
+        viewer.view([tmp_path / "absent"], web=True)
+    with pytest.raises(SessionError, match=r"holds no run\.rrd and no session\.toml"):
+        viewer.view([tmp_path], web=True)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    with pytest.raises(SmartnavError, match=r"no display .*; expected a graphical desktop; add --web"):
+        viewer.view([])
