@@ -16,6 +16,7 @@ from smartnav_graph import session as session_model
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names, progress
 from smartnav_graph.errors import CalibrationError, ConfigError, SessionError
+from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.run_folder import plain, read_run
 from smartnav_graph.session import Session
 from smartnav_graph.vision import benchmark as scores
@@ -33,9 +34,9 @@ class Match(Command):
     """Matched points, or tracks, of a session's pictures; they are kept in the session, and read again by a second
     call with the same options.
 
-    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells. With
-    --map the session gets pose fixes instead: of its pictures in a COLMAP model, whose scale and frame are found from
-    positions that are known without it.
+    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells, or that
+    of --reference. With --map the session gets pose fixes instead: of its pictures in a COLMAP model, whose scale and
+    frame are found from positions that are known without it.
 
     Example: smartnav match lund --features sift
     """
@@ -57,6 +58,8 @@ class Match(Command):
     """Pictures a second at most, 0 for all; by default 4, for tracks and with --benchmark all."""
     benchmark: Switch = False
     """True matches, useful pairs and times, beside those of the thesis."""
+    reference: FilePath = None
+    """For --benchmark: true poses beside the session, as `smartnav evaluate` takes them."""
     from_file: FilePath = None
     """Take the matches of this match file of 2012 instead of finding some."""
     to_file: FilePath = None
@@ -82,6 +85,8 @@ class Match(Command):
             raise ConfigError(given[1], f"is given with {given[0]}", "one of them", "call twice")
         if self.known is not None and self.map is None:
             raise ConfigError("--known", "is given without --map", "a model to lay on the run", "add --map MODEL")
+        if self.reference is not None and not self.benchmark:
+            raise ConfigError("--reference", "is given without --benchmark", "something to compare", "add --benchmark")
         if self.benchmark:
             self._benchmark()
         elif self.map is not None:
@@ -108,6 +113,8 @@ class Match(Command):
         asked = names(self.features) or tuple(kinds.available())
         config = self._config(asked[0], "1", self.rate or 0.0)
         session = readers.load(self.session)
+        if self.reference is not None:
+            session = session.replace(reference=load_reference(self.reference))
         with progress(self.quiet) as show:
             found = scores.compare(session, asked, config, workers=self.workers, progress=show)
         if self.json:
@@ -218,6 +225,10 @@ def print_scores(found: Sequence[Score], *, all_known: bool) -> None:
     for name in [name for name in kinds.KINDS if all_known and name not in {one.features for one in found}]:
         table.add_row(name, *["-"] * 5, *_published(scores.THESIS.get(name)))
     Console(width=120).print(table)
+    print(
+        f"true: within {scores.TOLERANCE_PX} px of the known geometry; >= 5 true: share of pairs with five such matches"
+    )
+    print("thesis: the same of other pictures, and seconds, as published in 2012")
     if len(table.rows) > len(found):
         print("-: not in the installed build of OpenCV (see scripts/reproduce_features)")
     if found[0].skipped:

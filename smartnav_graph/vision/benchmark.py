@@ -98,7 +98,7 @@ class CameraPoses:
         """
         reference = session.reference
         if reference is None or reference.quat is None or len(reference) < 2:
-            where, remedy = session.path or "session", "import a log with poses"
+            where, remedy = session.path or "session", "import a log with poses, or give --reference FILE"
             raise SessionError(where, "has no reference with attitude", "reference.parquet with qw, qx, qy, qz", remedy)
         offset = 0 if session.calibration is None else session.calibration.cameras[camera].time_offset_s
         times = np.asarray(t_ns + round(offset * NS), dtype=np.int64)

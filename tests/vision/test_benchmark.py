@@ -1,5 +1,6 @@
 """True matches by known poses: exact points, wrong poses, no baseline; and the table over pictures."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from scenes2d import CAMERA, PERIOD_NS, seen, session_of, texture
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
+from smartnav_graph.cli import main
 from smartnav_graph.cli.match import print_scores
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.session import Mount
@@ -165,6 +167,19 @@ def test_standing_still_is_judged_by_rotation(dataset):
     found = score(session.replace(reference=truth), FrontEndConfig(spans=(1,), rate_hz=0.0))
     assert found.pairs == found.rotation_pairs == 5 and found.skipped == {"missing file": 89}
     assert found.true_rate > 0.8  # the truth's own attitude wavers by a pixel
+
+
+def test_true_poses_may_stand_beside_the_session(dataset, capsys):
+    folder = dataset("euroc_v101")
+    asked = ["match", str(folder), "--benchmark", "--features", "orb", "--json", "--quiet"]
+    assert main(asked) == 1
+    assert "give --reference FILE" in capsys.readouterr().err
+    truth = folder / "groundtruth_openvins" / "V1_01_easy.csv"
+    assert main([*asked, "--reference", str(truth)]) == 0
+    (found,) = json.loads(capsys.readouterr().out)
+    assert found["pairs"] == 5 and found["true_rate"] > 0.8 and found["thesis"]["true_rate"] == 0.8499
+    assert main(["match", str(folder), "--reference", str(truth)]) == 1
+    assert "--reference: is given without --benchmark" in capsys.readouterr().err
 
 
 def test_the_table_names_what_this_build_lacks(tmp_path, capsys):
