@@ -157,15 +157,30 @@ def test_export_of_pictures_with_their_place(call, workshop, tmp_path):
     assert call(line)[0] == 1 and call(f"{line} --force")[0] == 0
 
 
-def test_compare_tells_how_far_two_runs_are_apart(call):
+def test_compare_tells_how_far_two_runs_are_apart(call, tmp_path):
     code, out, _ = call("compare run run --json")
     same = json.loads(out)
     assert code == 0 and same["epochs"] == 22
-    assert same["position_m"]["max"] == 0.0 and same["sigma_ratio"]["position"] == 1.0 and same["config"] == {}
+    assert same["position_m"]["max"] == 0.0 and same["position_m"]["sigma_ratio"] == 1.0
+    assert (same["config"], same["rejected"], same["figures"]) == ({}, {}, {})
     other = json.loads(call("compare run replay --json")[1])
-    assert other["sigma_ratio"]["position"] < 1.0  # the replay kept every fix
+    assert other["position_m"]["sigma_ratio"] < 1.0  # the replay kept every fix
     assert other["config"] == {"run.withhold": [["gnss:every=2"], []], "replay.lag_s": [10.0, 5.0]}
-    assert "replay.lag_s: 10.0 | 5.0" in call("compare run replay")[1]
+    assert other["figures"]["mode"] == ["batch", "replay fixed-lag"]
+    code, out, _ = call(f"compare run replay --out {tmp_path}/both.rrd")
+    assert code == 0 and "replay.lag_s: 10 | 5" in out and (tmp_path / "both.rrd").stat().st_size > 10_000
+    code, _, err = call(f"compare run replay --out {tmp_path}/both.rrd")
+    assert code == 1 and "both.rrd: exists already" in err
+
+
+def test_explain_tells_what_determined_a_state(call):
+    code, out, err = call("explain run --at 10")
+    assert (code, err) == (0, "")
+    assert "What is uncertain about the position comes from" in out and "pull in sigmas" in out
+    told = json.loads(call("explain run --json")[1])
+    assert told["asked_s"] is None and told["keyframe"]["of"] == 22
+    code, _, err = call("explain run --at 99")
+    assert code == 1 and "--at: 99 s; expected 0.000 to 20.000 s, where the run is" in err
 
 
 def test_info_of_a_degraded_session(call, tmp_path):

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
-from smartnav_graph.cli.text import statistics_line
+from smartnav_graph.files import refuse_existing
 from smartnav_graph.run_folder import plain, read_run
 
 
@@ -38,33 +38,34 @@ class Explain(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(Command):
-    """A run against another: how far apart they are, how their sigmas differ, and what was asked of each.
+    """A run against another: how far apart they are and where, how their sigmas differ, what was asked of each, what
+    each rejected, and the figures that differ; as a table, and with --out as one recording for the Rerun viewer.
 
-    Example: smartnav compare kitti-run kitti-replay
+    Example: smartnav compare kitti-run kitti-replay --out both.rrd
     """
 
     first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN1")]
     """Run folder."""
     second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN2")]
     """Run folder."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write both as one recording (.rrd): both paths, their differences along time."""
+    force: Switch = False
+    """Replace the file."""
     json: Switch = False
     """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
-        from smartnav_graph.evaluation.compare import compare
-        from smartnav_graph.run_folder import config_differences
+        from smartnav_graph.differences import compare_runs
 
-        found = compare(read_run(self.first).solution, read_run(self.second).solution)
-        options = config_differences(self.first, self.second)
+        if self.out is not None:
+            refuse_existing(self.out, self.force)
+        found = compare_runs(read_run(self.first), read_run(self.second))
+        if self.out is not None:
+            found.write_recording(self.out, force=self.force)
         if self.json:
-            print(json.dumps(plain({**found.to_dict(), "config": options}), allow_nan=False))
+            print(json.dumps(plain(found.to_dict()), allow_nan=False))
             return
-        print(f"{found.epochs} common epochs of {self.first} and {self.second}")
-        for name, unit in (("position", "m"), ("rotation", "deg"), ("velocity", "m/s")):
-            print(statistics_line(name, unit, found.to_dict()[f"{name}_{unit.replace('/', '_')}"]))
-        print(
-            f"sigma       median ratio second / first: position {found.sigma_ratio['position']:.3f}, "
-            f"rotation {found.sigma_ratio['rotation']:.3f}, velocity {found.sigma_ratio['velocity']:.3f}"
-        )
-        for key, (one, other) in options.items():
-            print(f"config      {key}: {one} | {other}")
+        print(found.to_text())
+        if self.out is not None:
+            print(f"recording: {self.out}")

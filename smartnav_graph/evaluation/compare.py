@@ -1,31 +1,118 @@
-"""How far two solutions of one session are apart."""
+"""How far two solutions of one session are apart, and what else differs between two runs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from smartnav_graph.errors import SessionError
 from smartnav_graph.evaluation.align import Track, track_of_solution
-from smartnav_graph.evaluation.metrics import Statistics, rotation_error_deg
-from smartnav_graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.evaluation.metrics import Statistics
+from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Solution
+from smartnav_graph.timebase import interpolate, seconds_since
+
+Floats = NDArray[np.float64]
+DEG = float(np.degrees(1.0))
+
+
+class Measure(NamedTuple):
+    """Components of the state whose difference is told as one magnitude, in a unit `factor` times smaller than SI."""
+
+    name: str
+    components: slice
+    unit: str
+    factor: float = 1.0
+
+
+MEASURES = (
+    Measure("position_m", POS, "m"),
+    Measure("horizontal_m", slice(3, 5), "m"),
+    Measure("height_m", slice(5, 6), "m"),
+    Measure("rotation_deg", ROT, "deg", DEG),
+    Measure("heading_deg", slice(2, 3), "deg", DEG),
+    Measure("velocity_m_s", VEL, "m/s"),
+    Measure("accel_bias_m_s2", ACCEL_BIAS, "m/s²"),
+    Measure("gyro_bias_deg_s", GYRO_BIAS, "deg/s", DEG),
+)
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Magnitudes of one difference: statistics, when it is largest, that largest one in sigmas (the larger of the two
+    runs'), and the median ratio of the sigmas, second over first."""
+
+    statistics: Statistics
+    largest_at_s: float
+    largest_sigmas: float
+    sigma_ratio: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Magnitudes of the differences at common epochs, and the median ratio of the sigmas, second over first."""
+    """Two solutions at n common epochs.
 
-    epochs: int
-    position_m: Statistics
-    rotation_deg: Statistics
-    velocity_m_s: Statistics
-    sigma_ratio: dict[str, float]
+    t_ns (n,); difference (n, 15) second less first: rotation (the vector theta of R_2 = Exp(theta) R_1), position,
+    velocity in nav axes, biases in body axes; position (n, 3) of the first, m; sigma_first, sigma_second (n, 15)
+    """
+
+    t_ns: NDArray[np.int64]
+    t0_ns: int
+    position: Floats
+    difference: Floats
+    sigma_first: Floats
+    sigma_second: Floats
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @cached_property
+    def seconds(self) -> Floats:
+        """Seconds (n,) since the session's time zero."""
+        return seconds_since(self.t_ns, self.t0_ns)
+
+    def magnitude(self, measure: Measure) -> Floats:
+        """Magnitudes (n,) of the difference in the measure's unit."""
+        return np.asarray(np.linalg.norm(self.difference[:, measure.components], axis=1) * measure.factor)
+
+    def apart(self, measure: Measure) -> Apart:
+        """The figures of one measure."""
+        magnitude = self.magnitude(measure)
+        first, second = (
+            np.linalg.norm(sigma[:, measure.components], axis=1) * measure.factor
+            for sigma in (self.sigma_first, self.sigma_second)
+        )
+        at = int(magnitude.argmax())
+        return Apart(
+            statistics=Statistics.of(magnitude),
+            largest_at_s=float(self.seconds[at]),
+            largest_sigmas=float(magnitude[at] / max(first[at], second[at])),
+            sigma_ratio=float(np.median(second / first)),
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures."""
-        return asdict(self)
+        """The figures of every measure."""
+        told: dict[str, Any] = {"epochs": len(self)}
+        for measure in MEASURES:
+            figures = asdict(self.apart(measure))
+            told[measure.name] = figures.pop("statistics") | figures
+        return told
+
+    def largest(self, count: int, apart_s: float) -> list[int]:
+        """Rows of the largest differences of position, each `apart_s` from those before it."""
+        magnitude = self.magnitude(MEASURES[0])
+        found: list[int] = []
+        left = np.ones(len(self), dtype=bool)
+        while left.any() and len(found) < count:
+            row = int(np.flatnonzero(left)[magnitude[left].argmax()])
+            found.append(row)
+            left &= np.abs(self.seconds - self.seconds[row]) >= apart_s
+        return found
 
 
 def compare(first: Solution, second: Solution) -> Comparison:
@@ -38,27 +125,75 @@ def compare(first: Solution, second: Solution) -> Comparison:
     """
     one, other = track_of_solution(first), track_of_solution(second)
     common = np.isin(one.t_ns, other.t_ns)
-    inside = one.take(common if common.sum() >= 2 else one.inside(other))
+    rows = common if common.sum() >= 2 else one.inside(other)
+    inside = one.take(rows)
     if not len(inside):
         raise SessionError("compare", "the two runs have no time in common", "two runs of one session")
     at = other.at(inside.t_ns)
-    angle = rotation_error_deg(inside, at)
-    assert angle is not None and inside.velocity is not None and at.velocity is not None
+    bias, sigma = (interpolate(inside.t_ns, second.t_ns, values) for values in (_biases(second), second.sigmas))
     return Comparison(
-        epochs=len(inside),
-        position_m=Statistics.of(np.linalg.norm(at.position - inside.position, axis=1)),
-        rotation_deg=Statistics.of(angle),
-        velocity_m_s=Statistics.of(np.linalg.norm(at.velocity - inside.velocity, axis=1)),
-        sigma_ratio={
-            name: _sigma_ratio(inside, at, block)
-            for name, block in (("position", POS), ("rotation", ROT), ("velocity", VEL))
-        },
+        t_ns=inside.t_ns,
+        t0_ns=first.t0_ns,
+        position=inside.position,
+        difference=np.concatenate([_moved(inside, at), bias - _biases(first)[rows]], axis=1),
+        sigma_first=first.sigmas[rows],
+        sigma_second=sigma,
     )
 
 
-def _sigma_ratio(one: Track, other: Track, block: slice) -> float:
-    assert one.covariance is not None and other.covariance is not None
-    of_one, of_other = (
-        np.trace(covariance[:, block, block], axis1=1, axis2=2) for covariance in (one.covariance, other.covariance)
-    )
-    return float(np.median(np.sqrt(of_other / of_one)))
+def _biases(solution: Solution) -> Floats:
+    return np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
+
+
+def _moved(one: Track, other: Track) -> Floats:
+    """Rotation, position and velocity (n, 9) from one track to the other."""
+    assert one.rotation is not None and other.rotation is not None  # of solutions
+    assert one.velocity is not None and other.velocity is not None
+    turn = Rotation.from_matrix(other.rotation @ one.rotation.transpose(0, 2, 1)).as_rotvec()
+    return np.concatenate([turn, other.position - one.position, other.velocity - one.velocity], axis=1)
+
+
+def rejected_sets(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """By sensor, rows that both runs rejected and that only one of them did, of two tables of summary.json."""
+
+    def rows(summary: Mapping[str, Any]) -> dict[str, set[int]]:
+        found: dict[str, set[int]] = {}
+        for one in summary.get("rejections", ()):
+            found.setdefault(str(one["sensor"]), set()).add(int(one["row"]))
+        return found
+
+    one, other = rows(first), rows(second)
+    told = {}
+    for name in sorted({*one, *other}):
+        a, b = one.get(name, set()), other.get(name, set())
+        told[name] = {"both": len(a & b), "only_first": sorted(a - b), "only_second": sorted(b - a)}
+    return told
+
+
+# Figures of summary.json that tell two runs apart, beside those of sensors and states; a dot goes into a table.
+FIGURES = (
+    *("mode", "vehicle", "duration_s", "path_m", "keyframes", "chi2_per_dof.overall", "iterations", "passes"),
+    *("converged", "position_sigma_m.median", "position_sigma_m.p95", "position_sigma_m.max", "timings_s.total"),
+)
+
+
+def figure_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Figures that differ between two tables of summary.json: path -> the value of each, None where it has none."""
+    one, other = _figures(first), _figures(second)
+    names = [*one, *(name for name in other if name not in one)]
+    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
+
+
+def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
+    found = {name: value for name in FIGURES if (value := _at(summary, name)) is not None}
+    for room, field in (("used", ""), ("rejected", ""), ("withheld", "rms_horizontal_m"), ("states", "value")):
+        for name, value in dict(summary.get(room, {})).items():
+            found[f"{room}.{name}"] = value.get(field) if field else value
+    return found
+
+
+def _at(summary: Mapping[str, Any], path: str) -> Any:
+    value: Any = summary
+    for name in path.split("."):
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value

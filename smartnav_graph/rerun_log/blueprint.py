@@ -131,7 +131,7 @@ def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None
         name = "Path (ENU)"
         if recorder.has("/world/est/covariances"):
             name += f", 3σ ellipsoids ×{factor:g}"
-        views.append(_world(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
+        views.append(world_view(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
         if solution is not None and recorder.has("/world/est/body"):
             views.append(_ride(solution, extent))
     if recorder.has("/graph"):
@@ -158,7 +158,7 @@ def _ride(solution: Solution, extent: Extent) -> Any:
     )
 
 
-def _world(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
+def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
     """The scene looked at along `direction` from where everything is in the picture."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -198,7 +198,7 @@ def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, see
     if recorder.has("/geo") and extent is not None and extent.size > SMALL:
         views.append(_map(session, extent))
     elif recorder.has("/world") and extent is not None:
-        views.append(_world("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
+        views.append(world_view("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
     for view in seen:
         if recorder.has(view.image) or (view.camera is not None and recorder.has(view.points)):
             views.append(_camera(view))
@@ -251,7 +251,7 @@ def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
     def series(names: Names, first: str = "") -> list[Any]:
         there = [(name, path) for name, path in names if recorder.has(path)]
         there.sort(key=lambda item: item[1] != first)
-        return [_series(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
+        return [series_view(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
 
     raw = series(_SIGNALS)
     # Without a solution there is room to show every signal at once.
@@ -259,7 +259,7 @@ def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
     states = (
         rrb.StateTimelineView(name="States", origin="/status", time_view=_whole()) if recorder.has("/status") else None
     )
-    log = rrb.TextLogView(name="Log", origin="/log", columns=_log_columns()) if recorder.has("/log") else None
+    log = rrb.TextLogView(name="Log", origin="/log", columns=log_columns()) if recorder.has("/log") else None
     count = 2.0 if solution is not None else 2.0 * max(1, len(raw))
     parts = [
         shown,
@@ -290,7 +290,7 @@ def _residuals(solution: Solution | None) -> list[Any]:
     # Position sensors tell most: they stand first; the inertial residuals are many and small.
     sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
-        _series(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], legend=_few(solution, name)) for name in sensors
+        series_view(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], legend=_few(solution, name)) for name in sensors
     ]
 
 
@@ -298,7 +298,7 @@ def _few(solution: Solution, sensor: str) -> bool:
     return int(solution.residuals.axis[solution.residuals.of(sensor)].max()) < 3
 
 
-def _series(
+def series_view(
     name: str,
     contents: list[str],
     *,
@@ -317,7 +317,7 @@ def _series(
     )
 
 
-def _log_columns() -> Any:
+def log_columns() -> Any:
     """Time, level and text: all lines come from one entity."""
     from rerun.blueprint.archetypes import TextLogColumns
     from rerun.blueprint.encodings import TextLogColumn, TimelineColumn

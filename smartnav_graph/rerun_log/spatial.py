@@ -63,11 +63,16 @@ def extent_of(session: Session, solution: Solution | None, causal: Solution | No
     candidates += [session.nav_position(stream) for stream in streams if stream is not None]
     for points in map(finite_rows, candidates):
         if len(points):
-            low, high = points.min(axis=0), points.max(axis=0)
-            centre = (low + high) / 2
-            shift = np.where(np.abs(centre) > 20_000.0, np.round(centre, -3), 0.0)
-            return Extent(low, high, shift, thinned(points, 2000))
+            return extent_around(points)
     return None
+
+
+def extent_around(points: Floats) -> Extent:
+    """Box of points (n, 3) m, n >= 1."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2
+    shift = np.where(np.abs(centre) > 20_000.0, np.round(centre, -3), 0.0)
+    return Extent(low, high, shift, thinned(points, 2000))
 
 
 def nice(value: float) -> float:
