@@ -17,18 +17,8 @@ ORDER = (
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "start", "initialise"),
     *("config", "withhold", "problem", "variance", "row_noise", "pair_gate", "track_gate", "revise"),
     *("first_state", "rejections", "assemble", "influence", "summary", "trace", "estimate"),
-    *(
-        "evaluation",
-        "intervals",
-        "export",
-        "report",
-        "rerun_log",
-        "run_folder",
-        "differences",
-        "explain",
-        "cli",
-        "__main__",
-    ),
+    *("evaluation", "intervals", "export", "report", "rerun_log"),
+    *("run_folder", "differences", "explain", "cli", "__main__"),
 )
 DOOR = "__init__"  # it alone may look everywhere
 HEAVY = {"rerun", "cv2", "pycolmap", "evo", "pandas", "matplotlib"}
