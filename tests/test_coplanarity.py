@@ -42,7 +42,7 @@ def test_images_hold_what_inertial_data_lose(room, seen):
     alone = smooth(room, options(coplanarity={"enabled": False}))
     without, (metres, degrees) = errors(alone.solution, room.reference), errors(seen.solution, room.reference)
     assert without[0] > 5.0  # m: half a minute of a phone's accelerometer
-    assert metres < 0.05 and degrees < 0.4
+    assert metres < 0.05 and degrees < 0.5
     assert metres < 0.02 * without[0] and degrees < 0.5 * without[1]
 
 

@@ -45,7 +45,8 @@ POSE_DOF = 5
 @dataclass(frozen=True)
 class CoplanarityConfig:
     """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
-    least_parallax (rad, median once the turn is taken out) : of a pair; reach : of the Cauchy loss of a match, sigmas;
+    least_parallax : of a pair (median once the turn is taken out), in sigmas of a match, of which noise alone makes 1.7;
+    reach : of the Cauchy loss of a match, sigmas;
     compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's
     attitude in the body and of its clock as states (zero: known; none given: as sure as the calibration says);
     row_time : points are taken as seen when the row they lie in was read, where the camera's readout is known."""
@@ -54,7 +55,7 @@ class CoplanarityConfig:
     rate_hz: float = 4.0
     spans: tuple[int, ...] = (1, 2, 4, 8)
     least_matches: int = 6
-    least_parallax: float = 0.01
+    least_parallax: float = 3.0
     reach: float = 2.0
     compress: bool = True
     boresight_sigma_deg: float | None = None
@@ -282,7 +283,7 @@ class CoplanarityBuilder:
         kept = use.sum(axis=1)
         share = kept / np.maximum(pairs.count, 1)
         few = (pairs.count < self.config.least_matches) | ((share >= LEAST_SHARE) & (kept < self.config.least_matches))
-        still, contrary = parallax < self.config.least_parallax, share < LEAST_SHARE
+        still, contrary = parallax < self.config.least_parallax * self.sigma, share < LEAST_SHARE
         return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
 
 
