@@ -5,7 +5,8 @@ it opens anywhere, offline, and prints. How lines are thinned stands in `smartna
 
 ``data-`` attributes carry the figures in full precision: ``#imu-holes[data-count]`` with ``.hole[data-start-s]
 [data-length-s][data-kind]``, ``tr[data-sensor][data-rejected]``, ``tr[data-withheld][data-rms-horizontal-m]``,
-``#sigma-at[data-t-s][data-sigma-horizontal-m]``.
+``#sigma-at[data-t-s][data-sigma-horizontal-m]``, ``#silence[data-start-s][data-length-s]``,
+``tr[data-state][data-value][data-sigma]``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from smartnav_graph.files import replacing
-from smartnav_graph.report import facts
+from smartnav_graph.report import constants, facts, usage
 from smartnav_graph.report.charts import Scored
 from smartnav_graph.report.sections import page
 from smartnav_graph.session import Session
@@ -63,14 +64,16 @@ def report_markdown(summary: Mapping[str, Any], evaluation: Any = None) -> str:
     told = facts.warnings(summary)
     parts += ["## Warnings", "\n".join(f"- **{what}** {remedy}".rstrip() for what, remedy in told)] if told else []
     compared = facts.evaluation_facts(evaluation)
-    start, start_table = facts.initialisation(summary)
+    start, start_table = constants.initialisation(summary)
     holes = [f"- {facts.hole_sentence(*hole)}" for hole in facts.gaps(summary)]
+    used = ("What was used", "\n".join(f"- {line}" for line in usage.why_lines(summary)), usage.used_table(summary, {}))
     tables = [
-        ("What was used", "\n".join(f"- {line}" for line in facts.why_lines(summary)), facts.used_table(summary, {})),
+        used,
+        ("Image pairs", "", usage.fates_table(summary, "image_pairs", "image pairs")),
         ("IMU holes", "\n".join(holes), None),
-        ("Withheld measurements", "", facts.withheld_table(summary)),
+        ("Withheld measurements", "", usage.withheld_table(summary)),
         ("Against the reference", facts.evaluation_sentence(compared), facts.evaluation_table(compared)),
-        ("Estimated constants", "", facts.states_table(summary)),
+        *((title, "", table) for title, table in constants.constants(summary)),
         ("Start", start, start_table),
         ("Solver", "", facts.solver_table(summary)),
         ("Timings", "", facts.timings_table(summary)),

@@ -87,8 +87,10 @@ def motion(solution: Solution, gaps: Intervals) -> str:
     known = solution.origin is not None
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
     title = "Height above the ellipsoid [m]" if known else "Height above the local origin [m]"
-    high = _over_time(solution, axis(height, least=0.5), title, gaps)
     sigma = solution.sigmas[:, POS][:, 2]
+    band = _core(np.concatenate([height - sigma, height + sigma]))
+    whole = np.ptp(band) < 10 * max(float(np.ptp(height)), 1.0) if len(band) else False
+    high = _over_time(solution, axis(np.concatenate([height, band]) if whole else height, least=0.5), title, gaps)
     high.band(t, height - sigma, height + sigma, "s0")
     high.line(t, height, "s0")
     return figure([fast, high], [("line s0", "Estimate"), ("band s0", "± 1 sigma"), *_shaded(gaps)])
@@ -177,26 +179,33 @@ def _histogram(sensor: str, white: Floats) -> str:
 
 def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
     """Whitened residuals of each sensor over time, rejected ones marked."""
+    plots, far, rejected = list[Plot](), list[str](), False
+    for sensor in residual_sensors(solution):
+        plots.append(_residual_plot(solution, sensor, gaps))
+        r = solution.residuals
+        rows = r.of(sensor) & np.isfinite(r.whitened)
+        rejected |= bool((rows & ~r.used).any())
+        n = int((np.abs(r.whitened[rows]) > MOST_FAR).sum())
+        far += [f"{sensor_name(sensor)} {count(n)}"] if n else []
+    note = f"Beyond ± {fixed(MOST_FAR, 0)} sigma, drawn at the edge: {', '.join(far)}." if far else ""
+    entries = [("dots res", "Used"), *([("dots out", "Rejected")] if rejected else []), ("line limit", "± 3 sigma")]
+    return figure(plots, [*entries, *_shaded(gaps)], note)
+
+
+def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
     r, t = solution.residuals, solution.seconds
     seconds = (r.t_ns - solution.t0_ns) / 1e9
-    figures = []
-    for sensor in residual_sensors(solution):
-        plot = Plot(time_axis(float(t[0]), float(t[-1])), _residual_axis(), f"{sensor} residuals over time")
-        plot.height_px, plot.y_title = 140, f"{sensor_name(sensor)} residual / sigma"
-        plot.spans(gaps)
-        for level in (-3.0, 3.0):
-            plot.rule(level, "limit")
-        far = 0
-        for used, cls in ((True, "res"), (False, "fix-rejected")):
-            rows = r.of(sensor) & (r.used == used) & np.isfinite(r.whitened)
-            x, y = seconds[rows], np.clip(r.whitened[rows], -MOST_FAR * 0.97, MOST_FAR * 0.97)
-            shown = thin_dots(np.abs(y) > 3.0, 1500)
-            plot.dots(x[shown], y[shown], cls)
-            far += int((np.abs(r.whitened[rows]) > MOST_FAR).sum())
-        note = f"{count(far)} beyond ± {fixed(MOST_FAR, 0)} sigma, drawn at the edge." if far else ""
-        figures.append(figure([plot], note=note))
-    entries = [("dots res", "Used"), ("dots fix-rejected", "Rejected"), ("line limit", "± 3 sigma"), *_shaded(gaps)]
-    return legend(entries) + "".join(figures)
+    plot = Plot(time_axis(float(t[0]), float(t[-1])), _residual_axis(), f"{sensor} residuals over time")
+    plot.height_px, plot.y_title = 110, f"{sensor_name(sensor)}, residual / sigma"
+    plot.spans(gaps)
+    for level in (-3.0, 3.0):
+        plot.rule(level, "limit")
+    for used, cls in ((False, "out"), (True, "res")):
+        rows = r.of(sensor) & (r.used == used) & np.isfinite(r.whitened)
+        y = np.clip(r.whitened[rows], -MOST_FAR * 0.97, MOST_FAR * 0.97)
+        shown = thin_dots(np.abs(y) > 3.0, 1500)
+        plot.dots(seconds[rows][shown], y[shown], cls)
+    return plot
 
 
 def _residual_axis() -> Axis:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from smartnav_graph.report.text import (
-    DASH,
     Row,
     Table,
     as_float,
@@ -31,8 +31,14 @@ SENSORS = {
     "gnss": ("GNSS", "GNSS fix", "GNSS fixes"),
     "control": ("Control points", "control point", "control points"),
     "pose_fixes": ("Pose fixes", "pose fix", "pose fixes"),
-    "prior": ("Prior", "prior", "priors"),
+    "imu_straying": ("Straying in IMU holes", "straying", "strayings"),
+    "prior": ("Start", "prior", "priors"),
     "rest": ("Rest at the start", "zero velocity", "zero velocities"),
+    "vehicle": ("Vehicle", "vehicle row", "vehicle rows"),
+    "steps": ("Steps", "stretch of steps", "stretches of steps"),
+    "gnss_wander": ("GNSS wander", "wander", "wanders"),
+    "gnss_velocity": ("GNSS velocity", "GNSS velocity", "GNSS velocities"),
+    "barometer_bias": ("Pressure drift", "drift", "drifts"),
     "static": ("Standstills", "standstill", "standstills"),
     "magnetometer": ("Magnetometer", "magnetometer sample", "magnetometer samples"),
     "barometer": ("Barometer", "pressure sample", "pressure samples"),
@@ -46,6 +52,7 @@ SENSORS = {
     "smart": ("Tracks in space", "track", "tracks"),
     "static_turn": ("Rests without turn", "rest without turn", "rests without turn"),
 }
+MOST_REJECTED = 0.25  # share of a sensor's rows that may be outliers
 HOLES = {"bridged": "bridged by interpolation", "missing": "no samples"}
 MODES = {
     "batch": "smoothed in one batch",
@@ -150,21 +157,43 @@ def _withheld(summary: Summary) -> str:
 
 def warnings(summary: Summary) -> list[tuple[str, str]]:
     """(what is wrong, what to do about it). A message ``found; expected; remedy`` is split at its first semicolon."""
-    told = [str(w) for w in summary.get("warnings") or [] if str(w).strip()]
-    if summary.get("converged") is False and not any("converge" in w for w in told):
+    told = [_with_sensor(str(w)) for w in summary.get("warnings") or [] if str(w).strip()]
+    if any(w.startswith("Dead reckoning") for w in told):  # says the same, and what follows from it
+        told = [w for w in told if not w.startswith("Session: no absolute sensor")]
+    if summary.get("converged") is False and not any("converge" in w or "iteration limit" in w for w in told):
         told.insert(
             0,
             f"The solver stopped after {plural(summary.get('iterations'), 'iteration')} without converging; "
             "look at the residuals below, exclude the sensor that does not fit, or give --initial",
         )
     overall = as_float(room(summary, "chi2_per_dof").get("overall"))
-    if overall is not None and not 0.3 < overall < 3.0 and not any("chi2" in w for w in told):
-        side = "larger" if overall > 1 else "smaller"
+    if overall is not None and overall > 3.0 and not any("chi" in w for w in told):
         told.append(
-            f"Residuals are {side} than the stated noise explains (chi2 per degree of freedom {number(overall)}, "
-            "1 is right); the sigmas in this report are wrong by about its root: set the noise in calibration.toml"
+            f"Residuals are larger than the stated noise explains (chi2 per degree of freedom {number(overall)}, "
+            "1 is right); the sigmas in this report are too small by about its root: set the noise in calibration.toml"
         )
+    told += _mostly_rejected(summary)
     return [(first.strip(), capital(rest.strip())) for first, _, rest in (w.partition(";") for w in told)]
+
+
+def _mostly_rejected(summary: Summary) -> list[str]:
+    """Sensors of positions of which more was rejected than outliers explain."""
+    told = []
+    for name, used in room(summary, "used").items():
+        kept, out = as_float(used) or 0.0, as_float(room(summary, "rejected").get(name)) or 0.0
+        if out > MOST_REJECTED * (kept + out):
+            told.append(
+                f"{sensor_name(name)}: {count(out)} of {things(name, kept + out)} rejected, too many for outliers; "
+                "they or the rest of the run are wrong: look at the residuals over time, and smooth the stretch in "
+                "question by itself (--from, --to)"
+            )
+    return told
+
+
+def _with_sensor(warning: str) -> str:
+    """``imu: 1 stretch ..`` -> ``IMU: 1 stretch ..``."""
+    first, colon, rest = warning.partition(": ")
+    return f"{sensor_name(first)}: {rest}" if colon and first.isidentifier() else capital(warning)
 
 
 def chi2_by_sensor(summary: Summary) -> dict[str, float]:
@@ -178,121 +207,6 @@ def chi2_by_sensor(summary: Summary) -> dict[str, float]:
 
 def withheld_counts(summary: Summary) -> dict[str, Any]:
     return {k: v.get("count") for k, v in room(summary, "withheld").items() if isinstance(v, Mapping)}
-
-
-def used_table(summary: Summary, recorded: Mapping[str, int]) -> Table:
-    """Per sensor: rows recorded (where told), factors used, rejected, withheld, dropped on reading, chi2 per dof."""
-    factors, rejected, dropped = (room(summary, k) for k in ("factors", "rejected", "dropped"))
-    withheld, chi2 = withheld_counts(summary), chi2_by_sensor(summary)
-    names = dict.fromkeys([*recorded, *factors, *rejected, *withheld, *dropped, *chi2])
-    rows = []
-    for name in names:
-        lost = round(sum(as_float(n) or 0.0 for n in room(dropped, name).values()))
-        known = [count(recorded.get(name))] if recorded else []
-        used = [count(t.get(name, 0)) for t in (factors, rejected, withheld)]
-        data = {"sensor": name, "used": factors.get(name), "rejected": rejected.get(name), "dropped": lost}
-        rows.append(Row([sensor_name(name), *known, *used, count(lost), number(chi2.get(name))], data))
-    first = ("Sensor", "Recorded") if recorded else ("Sensor",)
-    return Table((*first, "Factors", "Rejected", "Withheld", "Dropped", "χ² / dof"), rows)
-
-
-def why_lines(summary: Summary) -> list[str]:
-    """Why rows were not used."""
-    lines = [
-        f"{capital(things(name, n))} rejected: farther from the solution than {'its' if n == 1 else 'their'} "
-        "own uncertainty allows."
-        for name, n in room(summary, "rejected").items()
-        if as_float(n)
-    ]
-    for stream, reasons in room(summary, "dropped").items():
-        known = {reason: n for reason, n in room({"r": reasons}, "r").items() if as_float(n)}
-        lines += [f"{sensor_name(stream)}: {count(n)} {reason}." for reason, n in known.items()]
-    return lines
-
-
-def rejections_table(summary: Summary) -> Table:
-    """Every rejected measurement: when, which sensor, how far off."""
-    rows = []
-    for one in summary.get("rejections") or []:
-        size = as_float(one.get("size_m"))
-        off = metres(size) if size is not None else DASH
-        cells = [seconds(one.get("t_s"), 1), sensor_name(str(one.get("sensor"))), off, number(one.get("size_sigma"))]
-        rows.append(Row(cells, {"rejection-s": one.get("t_s"), "size-m": size}))
-    return Table(("Time", "Sensor", "Off by", "Times its sigma"), rows, frozenset({1}))
-
-
-def withheld_table(summary: Summary) -> Table:
-    rows = []
-    for name, score in room(summary, "withheld").items():
-        if isinstance(score, Mapping):
-            keys = ("rms_horizontal_m", "rms_3d_m", "max_m")
-            data = {"sensor": name, "withheld": score.get("count")} | {k.replace("_", "-"): score.get(k) for k in keys}
-            rows.append(
-                Row([sensor_name(name), count(score.get("count")), *(metres(score.get(k)) for k in keys)], data)
-            )
-    return Table(("Withheld", "Count", "RMS horizontal", "RMS 3D", "Largest"), rows)
-
-
-def states_table(summary: Summary) -> Table:
-    """Estimated constants such as clock offsets; the unit is the suffix of the name."""
-    rows = []
-    for name, state in room(summary, "states").items():
-        if isinstance(state, Mapping):
-            value, sigma, held = state.get("value"), state.get("sigma"), bool(state.get("held"))
-            cells = [
-                _state_name(name),
-                _values(value),
-                DASH if held else _values(sigma),
-                "held" if held else "estimated",
-            ]
-            rows.append(Row(cells, {"state": name, "value": value, "sigma": sigma, "held": str(held).lower()}))
-    return Table(("State", "Value", "1 sigma", ""), rows, frozenset({3}))
-
-
-UNITS = (
-    ("_rad_s", "rad/s"),
-    ("_m_s2", "m/s²"),
-    ("_m_s", "m/s"),
-    ("_deg", "°"),
-    ("_rad", "rad"),
-    ("_hpa", "hPa"),
-    ("_ut", "µT"),
-    ("_m", "m"),
-    ("_s", "s"),
-)
-
-
-def _state_name(name: str) -> str:
-    for suffix, unit in UNITS:
-        if name.endswith(suffix):
-            return f"{sensor_first(name.removesuffix(suffix))} [{unit}]"
-    return sensor_first(name)
-
-
-def sensor_first(name: str) -> str:
-    """``gnss_time_offset`` -> ``GNSS time offset``."""
-    first, *rest = name.split("_")
-    return " ".join([first.upper() if first in ("gnss", "imu") else capital(first), *rest])
-
-
-def _values(value: Any) -> str:
-    items = value if isinstance(value, list | tuple) else [value]
-    return ", ".join(number(v) for v in items)
-
-
-def initialisation(summary: Summary) -> tuple[str, Table]:
-    """How the start was found, in a sentence, and what else is known of it."""
-    start = summary.get("initialisation")
-    if isinstance(start, str):
-        return capital(start), Table(("", ""), [])
-    table = room(summary, "initialisation")
-    sentence = capital(str(table.get("sentence") or ""))
-    rest = {k: v for k, v in table.items() if k != "sentence" and not isinstance(v, Mapping)}
-    rows = [
-        Row([_state_name(k), str(v) if as_float(v) is None and not isinstance(v, list) else _values(v)])
-        for k, v in rest.items()
-    ]
-    return sentence, Table(("", ""), rows)
 
 
 def solver_table(summary: Summary) -> Table:
@@ -383,10 +297,34 @@ def relative_table(facts: Mapping[str, Any]) -> Table:
 
 
 def nees_table(facts: Mapping[str, Any]) -> Table:
-    """Normalised squared errors beside what an honest covariance gives: the number of components."""
-    rows = [
-        Row([capital(k), number(v), "1" if k == "yaw" else "3"])
-        for k, v in room(facts, "nees").items()
-        if as_float(v) is not None
-    ]
-    return Table(("Mean NEES", "Found", "Expected"), rows)
+    """Normalised squared errors beside what an honest covariance gives, the number of components; and how many times
+    larger the errors are than the sigmas say."""
+    rows = []
+    for name, found, expected in _nees(facts):
+        data = {"nees": name, "found": found}
+        rows.append(Row([capital(name), number(found), str(expected), number(math.sqrt(found / expected), 2)], data))
+    return Table(("Mean NEES", "Found", "Expected", "Errors / sigma"), rows)
+
+
+def _nees(facts: Mapping[str, Any]) -> list[tuple[str, float, int]]:
+    known = {name: as_float(value) for name, value in room(facts, "nees").items()}
+    return [(name, v, 1 if name == "yaw" else 3) for name, v in known.items() if v is not None and v >= 0]
+
+
+def nees_sentence(facts: Mapping[str, Any]) -> str:
+    """What the normalised errors mean for somebody who wants to rely on the sigmas."""
+    if not _nees(facts):
+        return ""
+    if str(facts.get("align") or "none") != "none":
+        return (
+            "NEES compares errors with the sigmas of this report. After alignment it says little: the aligned path has "
+            "errors also where the run started and its sigmas are nearly zero."
+        )
+    far = [(name, math.sqrt(v / n)) for name, v, n in _nees(facts) if v > 2.0 * n]
+    if not far:
+        return "NEES compares errors with the sigmas of this report: they are as large as they should be, or smaller."
+    told = listed([f"{name} errors are {number(times, 2)} times their sigma" for name, times in far])
+    return (
+        f"NEES compares errors with the sigmas of this report: {told}. Either the sigmas are too small, or the "
+        "reference is offset: check its datum, its antenna or body point (--body-T-ref) and its clock (--time-offset)."
+    )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.report import charts, facts, statistics, track
+from smartnav_graph.report import charts, constants, facts, statistics, timeline, track, usage
 from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres, plural
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
@@ -52,8 +52,9 @@ def page(
     parts = [
         warnings(summary),
         section("map", "Trajectory", track.draw(session, solution, holes, causal)),
+        section("timeline", "What happened when", timeline.draw(solution, summary, shaded, scored)),
         section("statistics", "The run in figures", statistics.table(session, solution, summary).html()),
-        used(session, summary),
+        used(session, solution, summary),
         imu_holes(summary, holes),
         *over_time(solution, shaded, causal),
         withheld(summary, scored, solution, shaded),
@@ -128,24 +129,47 @@ def warnings(summary: Summary) -> str:
     return section("warnings", "Warnings", f'<ul class="warnings">{items}</ul>', {"count": len(told)})
 
 
-def used(session: Session, summary: Summary) -> str:
+def used(session: Session, solution: Solution, summary: Summary) -> str:
     """What was used, dropped, rejected, and why."""
     recorded = {name: len(stream) for name, stream in session.streams().items() if name != "reference"}
-    lines = "".join(f"<li>{escape(line)}</li>" for line in facts.why_lines(summary))
+    lines = "".join(f"<li>{escape(line)}</li>" for line in usage.why_lines(summary))
     why = f'<ul class="plain">{lines}</ul>' if lines else '<p class="calm">Nothing was rejected or dropped.</p>'
     if not lines and not {"rejected", "dropped"} & set(summary):
         why = '<p class="calm">The run did not record what was rejected or dropped.</p>'
-    table = facts.used_table(summary, recorded).html()
-    note = (
+    careful = usage.careful_sentence(summary)
+    parts = [
+        usage.used_table(summary, recorded).html(),
+        why,
+        _silence(solution),
+        _rejections(summary),
+        *(
+            table.html()
+            for table in (
+                usage.fates_table(summary, "image_pairs", "image pairs"),
+                usage.fates_table(summary, "tracks", "tracked points in space"),
+                usage.assumed_table(summary),
+            )
+            if table
+        ),
+        f"<p>{escape(careful)}</p>" if careful else "",
         '<p class="fine">χ² / dof: squared residuals over their sigmas, per redundant measurement; '
-        "1 means the stated noise is right.</p>"
-    )
-    return section("used", "What was used", table + why + _rejections(summary) + note)
+        "1 means the stated noise is right.</p>",
+    ]
+    return section("used", "What was used", "".join(parts))
+
+
+def _silence(solution: Solution) -> str:
+    """The longest stretch without a position."""
+    silence = usage.longest_silence(solution)
+    if silence is None:
+        return ""
+    data = {"start-s": silence.start_s, "length-s": silence.length_s}
+    return f'<p id="silence"{attributes(data)}>{escape(usage.silence_sentence(silence))}</p>'
 
 
 def _rejections(summary: Summary) -> str:
     """The rejected measurements one by one, folded away."""
-    table = facts.rejections_table(summary)
+    table = usage.rejections_table(summary)
     if not table.rows:
         return ""
     head = f"Each of the {plural(len(table.rows), 'rejected measurement')}"
@@ -198,11 +222,14 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
 
 def withheld(summary: Summary, scored: Mapping[str, charts.Scored], solution: Solution, gaps: charts.Intervals) -> str:
     """Measurements kept from the estimate and scored against it."""
-    table = facts.withheld_table(summary)
+    table = usage.withheld_table(summary)
     if not table:
         return ""
     pictures = [charts.withheld(name, rows, solution, gaps) for name, rows in scored.items()]
-    lead = "<p>These measurements were kept from the estimate, then compared with it.</p>"
+    lead = (
+        "<p>These measurements were kept from the estimate, then compared with it; the differences hold the errors of "
+        "both.</p>"
+    )
     total = {"count": round(sum(as_float(n) or 0.0 for n in facts.withheld_counts(summary).values()))}
     return section("withheld", "Withheld measurements", lead + table.html() + "".join(pictures), total)
 
@@ -215,6 +242,8 @@ def against_reference(evaluation: Any, compared: Summary, solution: Solution, ga
     horizontal: NDArray[Any] = np.zeros(0) if error is None else np.linalg.norm(np.asarray(error)[:, :2], axis=1)
     tables = [facts.evaluation_table(compared), facts.relative_table(compared), facts.nees_table(compared)]
     body = f"<p>{escape(facts.evaluation_sentence(compared))}</p>" + "".join(t.html() for t in tables if t)
+    honest = facts.nees_sentence(compared)
+    body += f"<p>{escape(honest)}</p>" if honest else ""
     body += "".join(f'<p class="fine">{escape(str(note))}</p>' for note in getattr(evaluation, "notes", ()))
     body += charts.distribution(horizontal, "errors against the reference")
     if len(solution) > 1:
@@ -224,12 +253,14 @@ def against_reference(evaluation: Any, compared: Summary, solution: Solution, ga
 
 def machinery(summary: Summary) -> list[str]:
     """States, start, solver, timings, versions."""
-    sentence, start = facts.initialisation(summary)
+    sentence, start = constants.initialisation(summary)
     said = f"<p>{escape(sentence)}</p>" if sentence else ""
     began = said + (start.html() if start else "")
-    states, solver, versions = facts.states_table(summary), facts.solver_table(summary), facts.versions_table(summary)
+    clocks = "".join(f'<p class="clock">{escape(told)}</p>' for told in constants.clock_sentences(summary))
+    states = "".join(table.html() for _, table in constants.constants(summary))
+    solver, versions = facts.solver_table(summary), facts.versions_table(summary)
     return [
-        section("states", "Estimated constants", states.html() if states else ""),
+        section("states", "Clocks, mounts and noise", clocks + states),
         section("start", "How the start was found", began or '<p class="calm">The run did not record it.</p>'),
         section("solver", "Solver", solver.html() if solver else ""),
         section("timings", "Computing time", timing_bars(facts.timings(summary))),

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.report.facts import Certainty, room, sensor_name, withheld_counts
-from smartnav_graph.report.text import Row, Table, as_float, count, distance, duration, fixed, metres, number
+from smartnav_graph.report.text import Row, Table, as_float, count, distance, duration, fixed, metres, number, plural
 from smartnav_graph.session import Session
 from smartnav_graph.solution import POS, Solution
+from smartnav_graph.streams import Imu
+from smartnav_graph.timebase import interpolate, seconds_since
 
 Floats = NDArray[np.float64]
 
 AT_S = 300.0
-STILL_M_S = 0.1
+SLOW_M_S = 0.1
 
 
 def certainty(solution: Solution) -> Certainty | None:
@@ -62,6 +65,8 @@ def table(session: Session, solution: Solution, summary: Mapping[str, Any]) -> T
         ("Epochs (keyframes)", count(summary.get("keyframes", len(solution)))),
         *_images(session),
         *_motion(solution),
+        *_still(summary),
+        *_slow(solution),
         *_felt(session, solution),
     ]
     return Table(("", ""), [Row(cells) for cells in rows])
@@ -94,10 +99,25 @@ def _motion(solution: Solution) -> list[tuple[str, str]]:
         ),
         (f"Height, {above}", f"{fixed(height.min(), 2)} to {fixed(height.max(), 2)} m"),
     ]
-    still = float(np.diff(t)[(speed[1:] < STILL_M_S) & (speed[:-1] < STILL_M_S)].sum())
-    if still > 0:
-        rows.append((f"Standing still (below {STILL_M_S} m/s)", duration(still)))
     return rows
+
+
+def _slow(solution: Solution) -> list[tuple[str, str]]:
+    """Time at hardly any speed, whatever the reason."""
+    slow = np.linalg.norm(solution.nav_v_body, axis=1) < SLOW_M_S
+    return [(f"Slower than {SLOW_M_S} m/s", duration(float(np.diff(solution.seconds)[slow[1:] & slow[:-1]].sum())))]
+
+
+def _still(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Standstills that the detector found or the session listed."""
+    found = room(summary, "standstills")
+    stops, total, rest = (as_float(found.get(k)) for k in ("count", "total_s", "at_rest_s"))
+    if stops is None or total is None:
+        return []
+    if not stops:
+        return [("Standing still", "never found")]
+    rows = [("Standing still", f"{duration(total)} in {plural(stops, 'stop')}")]
+    return [*rows, ("Of it at rest, without any motion", duration(rest))] if rest is not None else rows
 
 
 def _felt(session: Session, solution: Solution) -> list[tuple[str, str]]:
@@ -108,16 +128,28 @@ def _felt(session: Session, solution: Solution) -> list[tuple[str, str]]:
     inside = (imu.t_ns >= solution.t_ns[0]) & (imu.t_ns <= solution.t_ns[-1])
     if not inside.any():
         return []
-    t = session.seconds(imu.t_ns[inside])
-    force = np.linalg.norm(imu.accel[inside], axis=1)
-    rate = np.degrees(np.linalg.norm(imu.gyro[inside], axis=1))
-    excess = np.abs(force - session.gravity)
-    f, a, r = int(np.argmax(force)), int(np.argmax(excess)), int(np.argmax(rate))
-    return [
-        ("Largest specific force (IMU)", f"{number(force[f])} m/s² at {fixed(t[f], 1)} s"),
-        ("Largest departure from gravity (IMU)", f"{number(excess[a])} m/s² at {fixed(t[a], 1)} s"),
-        ("Largest rotation rate (IMU)", f"{number(rate[r])} °/s at {fixed(t[r], 1)} s"),
+    imu = imu.take(inside)
+    signals = [
+        ("acceleration (IMU, gravity removed)", "m/s²", accelerations(imu, solution, session.gravity)),
+        ("specific force (IMU)", "m/s²", np.linalg.norm(imu.accel, axis=1)),
+        ("rotation rate (IMU)", "°/s", np.degrees(np.linalg.norm(imu.gyro, axis=1))),
     ]
+    t = session.seconds(imu.t_ns)
+    return [
+        (f"Largest {what}", f"{number(size.max())} {unit} at {fixed(t[int(np.argmax(size))], 1)} s")
+        for what, unit, size in signals
+    ]
+
+
+def accelerations(imu: Imu, solution: Solution, gravity: float) -> Floats:
+    """Size (n,) m/s^2 of the acceleration over ground at inertial samples: ``nav_R_body (f - bias) - gravity up``."""
+    bias = interpolate(imu.t_ns, solution.t_ns, solution.accel_bias)
+    if len(solution) > 1:
+        turned = Slerp(solution.seconds, Rotation.from_matrix(solution.nav_R_body))
+        R = turned(seconds_since(imu.t_ns, solution.t0_ns))
+    else:
+        R = Rotation.from_matrix(solution.nav_R_body[0])
+    return np.asarray(np.linalg.norm(R.apply(imu.accel - bias) - [0.0, 0.0, gravity], axis=1))
 
 
 def uncertainty_table(solution: Solution) -> Table:

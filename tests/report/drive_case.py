@@ -166,13 +166,24 @@ def summary(n: int = 470) -> dict[str, Any]:
         "duration_s": n - 1.0,
         "path_m": 4318.27,
         "keyframes": n,
-        "factors": {"imu": n - 1, "gnss": 231, "prior": 1},
+        "factors": {"imu": n - 1, "gnss": 231, "prior": 1, "vehicle": 460, "coplanarity": 60},
+        "used": {"gnss": 231},
+        "standstills": {"count": 2, "total_s": 21.5, "at_rest_s": 14.0, "spans_s": [[148.0, 158.5], [300.0, 311.0]]},
+        "image_pairs": {"in use": 60, "no baseline to speak of": 39, "contradicts the turn or the way": 1},
         "chi2_per_dof": {"overall": 1.04, "imu": 0.97, "gnss": 1.11},
         "iterations": 7,
         "converged": True,
         "states": {
             "gnss_time_offset_s": {"value": 0.0612, "sigma": 0.0031, "held": False},
             "gnss_lever_arm_m": {"value": [0.05, -0.31, 0.8], "sigma": None, "held": True},
+            "images_time_offset_s": {"value": -0.004, "sigma": 0.0005, "held": False},
+            "vehicle_mount": {
+                "value": [-0.0077, 0.0023, 0.13, -0.27, -0.99, 1.54, 0.0033, 0.0041],
+                "sigma": [0.0009, 0.0016, 0.06, 1.45, 0.27, 0.22, 0.0018, 0.0009],
+                "held": False,
+                "observed": [True, True, True, False, True, True, True, True],
+            },
+            "gnss_sigma_m": {"value": [0.6, 0.6, 1.2], "sigma": None, "held": False},
         },
         "timings_s": {
             "load": 0.12,
@@ -192,7 +203,7 @@ def summary(n: int = 470) -> dict[str, Any]:
         "withheld": {"gnss": {"count": 235, "rms_horizontal_m": 0.284, "rms_3d_m": 0.41, "max_m": 1.32}},
         "initialisation": {
             "method": "moving",
-            "sentence": "started while moving, heading from 31.2 m of displacement between the first 4 fixes",
+            "sentence": "started while moving, heading 31.2 deg +- 1.8 deg from the first 4 fixes",
             "sigma_heading_deg": 1.8,
         },
         "warnings": [

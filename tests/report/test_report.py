@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from drive_case import HOLES, REJECTED, drive, summary
 from lxml import html
+from scipy.spatial.transform import Rotation
 
 from smartnav_graph.errors import SessionError
-from smartnav_graph.report import report_markdown, write_report
+from smartnav_graph.report import facts, report_markdown, write_report
+from smartnav_graph.report.statistics import accelerations
 from smartnav_graph.session import Session
-from smartnav_graph.solution import Residuals
+from smartnav_graph.solution import Residuals, Solution
+from smartnav_graph.streams import Imu
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +114,18 @@ def test_reference_errors_are_tabled_with_percentiles(dom, case) -> None:
 def test_sections_stand_in_reading_order(dom) -> None:
     ids = [node.get("id") for node in dom.xpath("//header | //section")]
     assert ids == [
-        *("headline", "warnings", "map", "statistics", "used", "imu-holes", "uncertainty", "motion", "attitude"),
+        *(
+            "headline",
+            "warnings",
+            "map",
+            "timeline",
+            "statistics",
+            "used",
+            "imu-holes",
+            "uncertainty",
+            "motion",
+            "attitude",
+        ),
         *("biases", "residuals", "withheld", "reference", "states", "start", "solver", "timings", "versions"),
     ]
 
@@ -128,7 +142,103 @@ def test_statistics_of_motion_and_imu(dom, case) -> None:
     rate = np.degrees(np.linalg.norm(case.session.imu.gyro, axis=1))
     assert f"{speed.max():.1f} m/s" in text
     assert f"{rate.max():.1f} °/s at {rate.argmax() * 0.02:.1f} s" in text
-    assert "Standing still" in text
+    assert "Standing still 21.5 s in 2 stops Of it at rest, without any motion 14.0 s" in text
+    slow = np.diff(case.solution.seconds)[(speed[1:] < 0.1) & (speed[:-1] < 0.1)].sum()
+    assert f"Slower than 0.1 m/s {slow:.1f} s" in text
+
+
+def test_acceleration_is_over_ground() -> None:
+    """A body on its side that is pushed north with 2 m/s^2, its accelerometer biased."""
+    turned, bias = Rotation.from_euler("x", 90, degrees=True), np.array([0.1, -0.2, 0.3])
+    t_ns = np.arange(5) * 10**9
+    still = {name: np.zeros((5, 3)) for name in ("nav_t_body", "nav_v_body", "gyro_bias")}
+    solution = Solution(
+        t_ns=t_ns,
+        nav_R_body=np.tile(turned.as_matrix(), (5, 1, 1)),
+        accel_bias=np.tile(bias, (5, 1)),
+        covariance=np.zeros((5, 15, 15)),
+        t0_ns=0,
+        **still,
+    )
+    force = turned.inv().apply([0.0, 2.0, 9.81]) + bias
+    at = np.array([500_000_000, 3_200_000_000])
+    imu = Imu(t_ns=at, gyro=np.zeros((2, 3)), accel=np.tile(force, (2, 1)))
+    assert accelerations(imu, solution, 9.81) == pytest.approx([2.0, 2.0], abs=1e-9)  # m/s^2
+
+
+def test_never_standing_still_is_told(tmp_path, case) -> None:
+    none = summary() | {"standstills": {"count": 0, "total_s": 0.0, "at_rest_s": 0.0, "spans_s": []}}
+    assert "Standing still never found" in words(section(written(tmp_path, case, summary=none), "statistics"))
+
+
+def test_image_pairs_have_their_fate(dom) -> None:
+    text = words(section(dom, "used"))
+    assert "100 image pairs Count Share In use 60 60 % The camera hardly moved between the two 39 39 %" in text
+    assert "Contradict the motion that the other sensors tell 1 1 %" in text
+
+
+def test_what_was_assumed_stands_apart(dom) -> None:
+    (row,) = section(dom, "used").xpath('.//tr[@data-assumed="vehicle"]')
+    assert [words(c) for c in row] == ["Vehicle", "460", "wheels do not slide sideways or leave the road"]
+    assert not section(dom, "used").xpath('.//tr[@data-sensor="vehicle"]')
+
+
+def test_longest_stretch_without_a_fix(tmp_path, case) -> None:
+    r = case.solution.residuals
+    late = r.of("gnss") & (r.t_ns > case.solution.t0_ns + 200 * 10**9) & (r.t_ns < case.solution.t0_ns + 263 * 10**9)
+    dom = written(tmp_path, case, solution=replace(case.solution, residuals=replace(r, used=r.used & ~late)))
+    node = dom.get_element_by_id("silence")
+    assert (float(node.get("data-start-s")), float(node.get("data-length-s"))) == (200.0, 64.0)
+    assert words(node) == "The longest stretch without a GNSS fix in use is 64.0 s, from t = 200.0 s on."
+
+
+def test_clocks_mounts_and_noise_one_number_a_row(dom) -> None:
+    node = section(dom, "states")
+    rows = {words(row[0]): [words(cell) for cell in row[1:]] for row in node.xpath(".//tbody/tr")}
+    assert rows["GNSS time offset [s]"] == ["0.0612", "0.00310", "estimated"]
+    assert rows["GNSS lever arm, y [m]"] == ["−0.310", "–", "as given"]
+    assert rows["Vehicle's axes in the device, pitch [°]"] == ["−0.441", "0.0516", "estimated"]  # of -0.0077 rad
+    assert rows["Rear axle, left of the IMU [m]"] == ["−0.270", "1.45", "rests on its prior"]
+    assert rows["GNSS 1 sigma, up [m]"] == ["1.20", "–", "estimated"]
+    told = [words(p) for p in node.find_class("clock")]
+    assert told == [
+        "GNSS: a GNSS fix was taken 61 ms later than its stamp (1 sigma 3.1 ms).",
+        "Images: an image was taken 4.0 ms earlier than its stamp (1 sigma 0.50 ms).",
+    ]
+
+
+def test_timeline_has_a_lane_for_what_there_was(dom, case) -> None:
+    names = [words(t) for t in section(dom, "timeline").xpath('.//*[local-name()="text"][contains(@class, "note")]')]
+    assert names == ["GNSS in use, 4 rejected", "GNSS withheld", "Standing still", "IMU holes"]
+    lanes = section(dom, "timeline").xpath('.//svg[@class="box"]/path[contains(@class, "lane")]')
+    holes = [p for p in lanes if "hole" in p.get("class")]
+    starts = [float(re.match(r"M(\d+)", p.get("d"))[1]) / 10_000 * 469 for p in holes]
+    assert starts == pytest.approx([h[0] for h in HOLES], abs=0.05)  # s, half a drawing unit
+    assert len([p for p in lanes if "out" in p.get("class")]) == len(REJECTED)
+
+
+def test_too_many_rejections_are_a_warning(tmp_path, case) -> None:
+    bad = summary() | {"used": {"gnss": 300}, "rejected": {"gnss": 170}}
+    assert "GNSS: 170 of 470 GNSS fixes rejected, too many for outliers" in words(
+        section(written(tmp_path, case, summary=bad), "warnings")
+    )
+    assert "too many" not in words(section(written(tmp_path, case), "warnings"))
+
+
+def test_errors_far_beyond_the_sigmas_are_told_in_words(tmp_path, case) -> None:
+    table = case.evaluation.to_dict()
+    assert "After alignment it says little" in facts.nees_sentence(table)
+    told = facts.nees_sentence(table | {"align": "none", "nees": {"position": 75.0, "attitude": 3.1}})
+    assert "position errors are 5.0 times their sigma. Either the sigmas are too small" in told
+    assert "attitude" not in told
+    assert "as large as they should be" in facts.nees_sentence(table | {"align": "none"})
+
+
+def test_careful_noise_is_no_warning_but_told(tmp_path, case) -> None:
+    small = summary() | {"chi2_per_dof": {"overall": 0.18, "imu": 0.06, "gnss": 1.1}, "warnings": []}
+    dom = written(tmp_path, case, summary=small)
+    assert "No warnings." in words(section(dom, "warnings"))
+    assert "The residuals of IMU are smaller than the stated noise explains" in words(section(dom, "used"))
 
 
 def test_empty_summary_claims_nothing(tmp_path, case) -> None:
