@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,6 +29,7 @@ from smartnav_graph.first_state import initialiser_of
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
 from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
+from smartnav_graph.progress import Progress, silent, watched
 from smartnav_graph.revise import extra_passes, position_builders, revise
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
@@ -43,15 +44,10 @@ from smartnav_graph.trace import Trace, UpdateLog, Updates
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
-Progress = Callable[[str, int, int], None]
 
 
 # A polish that moves a state further than this starts anew from what it found.
 FAR_M, FAR_DEG = 0.1, 1.0
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +93,7 @@ class Clock:
 
 
 def one_pass(
-    smoother: Smoother, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory, problem: Problem
+    smoother: Smoother, windows: Iterable[Window], builders: Sequence[Builder], memory: Memory, problem: Problem
 ) -> None:
     """Every window through the smoother."""
     with _no_collection():
@@ -135,7 +131,7 @@ def solve_passes(
     warm: Any = None,
     unsure: bool = False,
     first_s: float = 0.0,
-    progress: Progress = _silent,
+    progress: Progress = silent,
     clock: Clock | None = None,
 ) -> tuple[Estimate, Memory, int]:
     """Batch passes until there is nothing more to learn.
@@ -151,9 +147,10 @@ def solve_passes(
     precision = FIRST if unsure else problem.config.solve
     builders, first = [prior, *problem.builders], warm
     for count in range(1, most + 1):
-        progress("solve", count - 1, most)
+        stage = f"pass {count} of at most {most}"
         smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
-        one_pass(smoother, windows, builders, memory, problem)
+        one_pass(smoother, watched(stage, windows, progress), builders, memory, problem)
+        progress(f"{stage}, solving", 0, 0)
         memory = _settled_pairs(smoother, problem.builders, memory)
         estimate = smoother.estimate()
         if clock is not None:
@@ -166,20 +163,20 @@ def solve_passes(
         cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
         warm = first if cold else estimate.values
         if learnt.stage > memory.stage and lost(problem.builders, estimate):
-            warm, learnt = _window_by_window(problem, windows, builders, learnt)
+            warm, learnt = _window_by_window(problem, windows, builders, learnt, progress)
         memory = learnt
     raise AssertionError("unreachable")
 
 
 def _window_by_window(
-    problem: Problem, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory
+    problem: Problem, windows: Sequence[Window], builders: Sequence[Builder], memory: Memory, progress: Progress
 ) -> tuple[Any, Memory]:
     """Values to begin from, and what they teach, where inertial data alone stray too far: as a replay has it, the
     trajectory never leaves what standstills and images hold."""
     smoother, t0_ns = incremental(ReplayConfig(), problem.session.t0_ns), problem.session.t0_ns
     first, previous = replace(memory, phase="causal", settled={}), None
     with _no_collection():
-        for window in windows:
+        for window in watched("window by window", windows, progress):
             smoother.update(build_step(window, previous, builders, first, t0_ns))
             previous = smoother.known()
     judged = replace(memory, settled={})
@@ -217,7 +214,7 @@ def initialise(problem: Problem, longest_s: float | None = None) -> Initial:
     return initialiser_of(problem, longest_s).run(solve, given)
 
 
-def smooth(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:
+def smooth(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
     """Batch smoothing of a recorded session.
 
     Raises
@@ -226,12 +223,15 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
         Bad input, or a problem that cannot be solved; the message says what to do.
     """
     clock = Clock()
+    progress("preparing", 0, 0)
     problem = prepare(session, config or Config())
     clock.lap("prepare")
+    progress("finding the start", 0, 0)
     initial = initialise(problem)
     warm, memory = initial.warm, initial.memory
     if not problem.session.absolute():
-        warm, memory = _window_by_window(problem, problem.windows, [initial.prior, *problem.builders], memory)
+        builders = [initial.prior, *problem.builders]
+        warm, memory = _window_by_window(problem, problem.windows, builders, memory, progress)
     _forget(problem.builders)
     clock.lap("initialise")
     estimate, memory, passes = solve_passes(
@@ -281,7 +281,7 @@ def _refuse_empty(problem: Problem, memory: Memory) -> None:
         )
 
 
-def replay(session: Session, config: Config | None = None, *, progress: Progress = _silent) -> Run:
+def replay(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
     """One window at a time, causal but for the initialisation stretch (at most 30 s); an interrupt leaves what is done.
 
     Raises
@@ -290,8 +290,10 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         As `smooth`.
     """
     clock = Clock()
+    progress("preparing", 0, 0)
     problem = prepare(session, config or Config(), causal=True)
     clock.lap("prepare")
+    progress("finding the start", 0, 0)
     initial = initialise(problem, longest_s=30.0)
     clock.lap("initialise")
     options = problem.config.replay
@@ -302,11 +304,9 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     log = UpdateLog()
     states: list[State] = []
     interrupted = False
-    total = len(problem.windows)
     try:
         with _no_collection():  # a pause of Python's would be a late update
-            for window in problem.windows:
-                progress("replay", window.index, total)
+            for window in watched("replay", problem.windows, progress):
                 begin = time.perf_counter()
                 previous = states[-1] if states else None
                 step = build_step(window, previous, builders, memory, problem.session.t0_ns)

@@ -30,6 +30,7 @@ from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.estimate import Run
 from smartnav_graph.evaluation.metrics import Statistics
 from smartnav_graph.prediction import foretold_at
+from smartnav_graph.progress import Progress, silent, under
 from smartnav_graph.session import Session
 from smartnav_graph.streams import ABSOLUTE, PoseFix, Reference
 from smartnav_graph.timebase import NS, nearest
@@ -99,6 +100,7 @@ def intervals(
     made: FixesFromReference | None = None,
     seeds: int = 1,
     config: Config | None = None,
+    progress: Progress = silent,
 ) -> Iterator[Interval]:
     """Three kinds of error for every spacing and seed, as they are found.
 
@@ -115,12 +117,15 @@ def intervals(
     SessionError, ConfigError, SolverError
         No fixes, no common time, a spacing that leaves fewer than two fixes, or what `estimate.replay` raises.
     """
-    for spacing in every_s:
-        if not spacing > 0:
-            raise ConfigError("--every", f"{spacing}", "spacings > 0 s")
-        for seed in range(seeds if made is not None else 1):
-            fixed = with_fixes(session, reference, spacing, made, seed) if made else _thinned(session, spacing)
-            yield from _scored(fixed, reference, spacing, seed, made is not None, config or Config())
+    wrong = [spacing for spacing in every_s if not spacing > 0]
+    if wrong:
+        raise ConfigError("--every", f"{wrong[0]}", "spacings > 0 s")
+    runs = [(spacing, seed) for spacing in every_s for seed in range(seeds if made is not None else 1)]
+    for count, (spacing, seed) in enumerate(runs, 1):
+        fixed = with_fixes(session, reference, spacing, made, seed) if made else _thinned(session, spacing)
+        watch = under(f"run {count} of {len(runs)}", progress)
+        run = estimate.replay(fixed, _at_keyframes(config or Config()), progress=watch)
+        yield from _scored(run, reference, spacing, seed, made is not None)
 
 
 def with_fixes(session: Session, reference: Reference, every_s: float, made: FixesFromReference, seed: int) -> Session:
@@ -183,12 +188,12 @@ def _fix_times(session: Session) -> Times:
     return np.unique(np.concatenate([np.zeros(0, np.int64), *stamps]))
 
 
-def _scored(
-    session: Session, reference: Reference, every_s: float, seed: int, made: bool, config: Config
-) -> Iterator[Interval]:
-    """One replay, and its three rows."""
-    config = replace(config, run=replace(config.run, rate="keyframes"))
-    run = estimate.replay(session, config)
+def _at_keyframes(config: Config) -> Config:
+    return replace(config, run=replace(config.run, rate="keyframes"))
+
+
+def _scored(run: Run, reference: Reference, every_s: float, seed: int, made: bool) -> Iterator[Interval]:
+    """The three rows of one replay."""
     sensor = Sensor.of(run) if made else Sensor()
     times = _fix_times(run.session)
     between = (reference.t_ns > times[0]) & (reference.t_ns < times[-1]) & ~np.isin(reference.t_ns, times)

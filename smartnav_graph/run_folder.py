@@ -29,6 +29,7 @@ from smartnav_graph.export import write_trajectory_csv
 from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.frames import Origin
 from smartnav_graph.influence import Influence
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Session, write_table
 from smartnav_graph.solution import Residuals, Solution
 
@@ -85,6 +86,7 @@ def write_run(
     recording: bool = True,
     evaluation: Evaluation | None = None,
     load_s: float = 0.0,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Write the folder of a run, all or nothing.
 
@@ -95,6 +97,7 @@ def write_run(
     report, recording : write report.html, run.rrd
     evaluation : comparison with a reference, shown in both and told in summary.json
     load_s : seconds that reading the session took
+    progress : told what is being written
 
     Returns
     -------
@@ -115,11 +118,12 @@ def write_run(
     with replacing(path, force=force) as folder:
         try:
             folder.mkdir()
+            progress("writing tables", 0, 0)
             _write_tables(run, folder)
             (folder / "config.toml").write_text(config_model.dumps(run.problem.config), encoding="utf-8")
             calibration = calibration_model.dumps(run.problem.calibration)
             (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
-            _write_views(run, folder, plain(told), evaluation, report, recording)
+            _write_views(run, folder, plain(told), evaluation, report, recording, progress)
             summary = plain(_timed(told, load_s, time.perf_counter() - begin))
             text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
             (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
@@ -202,7 +206,13 @@ def recorded(run: Run) -> Session:
 
 
 def _write_views(
-    run: Run, folder: Path, told: Mapping[str, Any], evaluation: Evaluation | None, report: bool, recording: bool
+    run: Run,
+    folder: Path,
+    told: Mapping[str, Any],
+    evaluation: Evaluation | None,
+    report: bool,
+    recording: bool,
+    progress: Progress,
 ) -> None:
     from smartnav_graph.report import report_markdown, write_report
     from smartnav_graph.rerun_log import write_latency, write_recording
@@ -210,6 +220,7 @@ def _write_views(
     common: dict[str, Any] = {"session": recorded(run), "solution": run.solution, "summary": told}
     common |= {"evaluation": evaluation, "causal": run.causal}
     if recording:
+        progress("writing the recording", 0, 0)
         # a summary without its timings: equal runs give equal recordings
         steady = {key: value for key, value in told.items() if key not in UNSTEADY}
         markdown = report_markdown(steady, evaluation)
@@ -217,6 +228,7 @@ def _write_views(
         if run.trace is not None and run.trace.updates is not None:
             write_latency(folder / "latency.rrd", session=run.session, trace=run.trace, identity=identity)
     if report:
+        progress("writing the report", 0, 0)
         write_report(folder / "report.html", withheld=run.withheld, **common)
 
 

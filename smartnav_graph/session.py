@@ -23,6 +23,7 @@ from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.errors import CalibrationError, SessionError
 from smartnav_graph.files import replacing
 from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.progress import Progress, silent, watched
 from smartnav_graph.streams import (
     ABSOLUTE,
     STREAMS,
@@ -232,22 +233,22 @@ class Session:
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
 
 
-def save(session: Session, path: str | Path, *, force: bool = False) -> None:
+def save(session: Session, path: str | Path, *, force: bool = False, progress: Progress = silent) -> None:
     """Write a session folder: session.toml and one Parquet file a stream. Replaces nothing without `force`."""
     with replacing(path, force=force) as folder:
         folder.mkdir()
-        for name, stream in session.streams().items():
+        for name, stream in watched("writing streams", list(session.streams().items()), progress):
             write_table(stream.columns(), folder / f"{name}.parquet")
         if session.calibration is not None:
             (folder / "calibration.toml").write_text(calibration_model.dumps(session.calibration), encoding="utf-8")
-        _copy_pictures(session, folder / PICTURES)
+        _copy_pictures(session, folder / PICTURES, progress)
         (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
 
 
-def _copy_pictures(session: Session, folder: Path) -> None:
+def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
     if session.images is None or session.pictures is None:
         return
-    for file in map(str, session.images.file):
+    for file in watched("copying pictures", list(map(str, session.images.file)), progress):
         source = session.pictures / file
         if file and not Path(file).is_absolute() and source.is_file():
             (folder / file).parent.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.files import refuse_existing
 from smartnav_graph.run_folder import plain, read_run
 
@@ -32,7 +33,9 @@ class Explain(Command):
     def run(self) -> None:
         from smartnav_graph.explain import explain
 
-        found = explain(read_run(self.run_path), self.at)
+        with progress(self.quiet) as show:
+            show(f"looking into {self.run_path}", 0, 0)
+            found = explain(read_run(self.run_path), self.at)
         print(json.dumps(plain(found.to_dict()), allow_nan=False) if self.json else found.to_text())
 
 
@@ -60,9 +63,12 @@ class Compare(Command):
 
         if self.out is not None:
             refuse_existing(self.out, self.force)
-        found = compare_runs(read_run(self.first), read_run(self.second))
-        if self.out is not None:
-            found.write_recording(self.out, force=self.force)
+        with progress(self.quiet) as show:
+            show("comparing", 0, 0)
+            found = compare_runs(read_run(self.first), read_run(self.second))
+            if self.out is not None:
+                show("writing the recording", 0, 0)
+                found.write_recording(self.out, force=self.force)
         if self.json:
             print(json.dumps(plain(found.to_dict()), allow_nan=False))
             return

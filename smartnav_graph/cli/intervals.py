@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 
 from smartnav_graph import readers
-from smartnav_graph.cli.options import Asking, Switch, progress, repairs
+from smartnav_graph.cli.options import Asking, Switch, repairs
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.intervals import FixesFromReference, Interval, intervals
 from smartnav_graph.readers.reference import load_reference
@@ -50,13 +51,10 @@ class Intervals(Asking):
         session = readers.load(self.session, repairs=repairs(self.repair))
         reference = self._reference(session)
         every = numbers("--every", self.every)
-        made = self._made() if self.fixes_from_reference else None
-        total = 3 * len(every) * (self.seeds if made else 1)
-        found: list[Interval] = []
+        made, config = self._made() if self.fixes_from_reference else None, self.resolved()
         with progress(self.quiet) as show:
-            for row in intervals(session, reference, every, made=made, seeds=self.seeds, config=self.resolved()):
-                found.append(row)
-                show("intervals", len(found), total)
+            rows = intervals(session, reference, every, made=made, seeds=self.seeds, config=config, progress=show)
+            found = list(rows)
         print(json.dumps(plain([r.to_dict() for r in found]), allow_nan=False) if self.json else intervals_text(found))
 
     def _reference(self, session: Session) -> Reference:

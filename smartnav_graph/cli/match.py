@@ -14,7 +14,8 @@ import tyro
 from smartnav_graph import readers
 from smartnav_graph import session as session_model
 from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names, progress
+from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.errors import CalibrationError, ConfigError, SessionError
 from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.run_folder import plain, read_run

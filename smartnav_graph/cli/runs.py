@@ -12,7 +12,8 @@ import tyro
 
 from smartnav_graph import estimate, readers
 from smartnav_graph.calibration import model as calibration_model
-from smartnav_graph.cli.options import Estimating, Writing, given, progress, repairs
+from smartnav_graph.cli.options import Estimating, Writing, given, repairs
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.config import Config
 from smartnav_graph.errors import SessionError, SmartnavError
@@ -58,13 +59,14 @@ class Replay(Estimating):
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> None:
     """Load, estimate, write, tell."""
     check_out(command.out, command.force)
-    begin = time.perf_counter()
-    session = readers.load(command.session, repairs=repairs(command.repair))
-    load_s = time.perf_counter() - begin
     with progress(command.quiet) as show:
+        show(f"reading {command.session}", 0, 0)
+        begin = time.perf_counter()
+        session = readers.load(command.session, repairs=repairs(command.repair))
+        load_s = time.perf_counter() - begin
         run = (estimate.replay if causal else estimate.smooth)(session, config, progress=show)
-    evaluation = against_own_reference(run)
-    summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s)
+        evaluation = against_own_reference(run)
+        summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s, progress=show)
     if "interrupted" in summary["mode"] and not command.quiet:
         print("smartnav: interrupted; what was done until then is written", file=sys.stderr)
     print_findings(run_text(summary, command.out))

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import statistics_line
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.evaluation import Evaluation, evaluate
@@ -42,14 +43,20 @@ class Evaluate(Command):
     """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
-        found = evaluate(
-            read_run(self.run_path).named(self.solution),
-            load_reference(self.reference, times=self.times, body_T_ref=self.body_T_ref),
-            align=self.align,
-            time_offset_s=_offset(self.time_offset),
-            solution_name=self.solution,
-            reference_name=str(self.reference),
-        )
+        offset = _offset(self.time_offset)
+        with progress(self.quiet) as show:
+            show(f"reading {self.reference}", 0, 0)
+            reference = load_reference(self.reference, times=self.times, body_T_ref=self.body_T_ref)
+            solution = read_run(self.run_path).named(self.solution)
+            show("comparing", 0, 0)
+            found = evaluate(
+                solution,
+                reference,
+                align=self.align,
+                time_offset_s=offset,
+                solution_name=self.solution,
+                reference_name=str(self.reference),
+            )
         print(json.dumps(plain(found.to_dict()), allow_nan=False) if self.json else evaluation_text(found))
 
 

@@ -10,9 +10,9 @@ import tyro
 
 from smartnav_graph import session as session_model
 from smartnav_graph.cli.options import Command, Repairs, SourceName, Switch, Text, Writing, repairs
+from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
 from smartnav_graph.files import refuse_existing, refuse_foreign
-from smartnav_graph.session import Session
 
 HEADER = "session.toml"
 
@@ -49,7 +49,12 @@ class Import(Writing):
         from smartnav_graph import readers
 
         check_out(self.out, self.force)
-        save(readers.read(self.source, self.format, repairs(self.repair)), self.out, self.force)
+        with progress(self.quiet) as show:
+            show(f"reading {self.source}", 0, 0)
+            session = readers.read(self.source, self.format, repairs(self.repair))
+            session_model.save(session, self.out, force=self.force, progress=show)
+        print(session_text(session))
+        print(f"session: {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +72,9 @@ class Info(Command):
     def run(self) -> None:
         from smartnav_graph import health, readers
 
-        session = readers.load(self.session, repairs=repairs(self.repair))
+        with progress(self.quiet) as show:
+            show(f"reading {self.session}", 0, 0)
+            session = readers.load(self.session, repairs=repairs(self.repair))
         print_findings(session_text(session) + "\n" + health.inspect(session).to_text())
 
 
@@ -91,7 +98,8 @@ class Simulate(Writing):
 
         check_out(self.out, self.force)
         scenario = scenarios.named(self.scenario)
-        session = recording.write(scenario, self.seed, self.out, force=self.force)
+        with progress(self.quiet) as show:
+            session = recording.write(scenario, self.seed, self.out, force=self.force, progress=show)
         for name, value in recording.constants(scenario).items():
             print(f"{name} = {value}")
         print(session_text(session))
@@ -141,8 +149,11 @@ class DegradeSession(Writing):
             swaps=self.swaps,
             nan_rows=self.nan_rows,
         )
-        session = readers.load(self.session)
-        print(session_text(rules.write_degraded(session, options, self.seed, self.out, force=self.force)))
+        with progress(self.quiet) as show:
+            show(f"reading {self.session}", 0, 0)
+            session = readers.load(self.session)
+            told = rules.write_degraded(session, options, self.seed, self.out, force=self.force, progress=show)
+        print(session_text(told))
         print(f"session: {self.out}")
 
 
@@ -168,10 +179,3 @@ def check_out(path: Path, force: bool) -> None:
     """Raise unless a session may be written to `path`: a free place, or with `force` an older session."""
     refuse_existing(path, force)
     refuse_foreign(path, HEADER)
-
-
-def save(session: Session, path: Path, force: bool) -> None:
-    """Write a session folder and say what it holds."""
-    session_model.save(session, path, force=force)
-    print(session_text(session))
-    print(f"session: {path}")

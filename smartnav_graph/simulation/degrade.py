@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from smartnav_graph import repair, session
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.files import replacing
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Session
 from smartnav_graph.simulation import fixes
 from smartnav_graph.simulation.fixes import Outliers
@@ -203,7 +204,9 @@ def _disjoint_rows(n: int, options: Degrade, rng: np.random.Generator) -> list[N
     return [starts[kinds == kind] for kind in range(3)]
 
 
-def write_degraded(whole: Session, options: Degrade, seed: int, path: str | Path, *, force: bool = False) -> Session:
+def write_degraded(
+    whole: Session, options: Degrade, seed: int, path: str | Path, *, force: bool = False, progress: Progress = silent
+) -> Session:
     """Write the degraded session folder, row faults included; gives the valid part, as `degrade` does.
 
     Raises
@@ -213,10 +216,11 @@ def write_degraded(whole: Session, options: Degrade, seed: int, path: str | Path
     SessionError
         `path` exists and `force` is not given, the system refuses to write, or there is no imu to spoil.
     """
+    progress("spoiling", 0, 0)
     faulty = degrade(whole, options, seed)
     repairs = repair.check_names({*faulty.repairs, *options.repairs})
     with replacing(path, force=force) as folder:
-        session.save(faulty.replace(repairs=repairs), folder)
+        session.save(faulty.replace(repairs=repairs), folder, progress=progress)
         if options.repairs:
             table = spoil_rows(faulty.require_imu().columns(), options, seed)
             session.write_table(table, folder / "imu.parquet")

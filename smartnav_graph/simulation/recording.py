@@ -22,6 +22,7 @@ from smartnav_graph.calibration.model import BarometerNoise, Calibration, GnssNo
 from smartnav_graph.errors import ConfigError
 from smartnav_graph.files import replacing
 from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Device, Mount, Session
 from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import CameraModel
@@ -166,7 +167,9 @@ def _camera(ride: _Ride, model: CameraModel | None) -> dict[str, Stream | None]:
     return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
 
 
-def write(scenario: Scenario, seed: int, path: str | Path, *, force: bool = False) -> Session:
+def write(
+    scenario: Scenario, seed: int, path: str | Path, *, force: bool = False, progress: Progress = silent
+) -> Session:
     """The scenario's session as a folder, with its pictures where it renders some; gives the session.
 
     Pictures exist on disk only: a session in memory has their names.
@@ -176,11 +179,13 @@ def write(scenario: Scenario, seed: int, path: str | Path, *, force: bool = Fals
     SessionError
         `path` exists and `force` is not given, or the system refuses to write.
     """
+    progress("simulating", 0, 0)
     recorded = scenario(seed)
     with replacing(path, force=force) as folder:
-        session_model.save(recorded, folder)
+        session_model.save(recorded, folder, progress=progress)
         if scenario.camera is not None and scenario.camera.pictures is not None:
-            render.write(folder / "images", shots(scenario, seed))
+            assert recorded.images is not None  # of the camera
+            render.write(folder / "images", shots(scenario, seed), len(recorded.images), progress)
     return recorded
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.simulation.cameras import CameraModel, PictureModel, file_name
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
@@ -127,12 +128,13 @@ def pictures(
         yield np.clip(np.rint(exact + how.noise * rng.standard_normal(exact.shape)), 0, 255).astype(np.uint8)
 
 
-def write(folder: Path, shots: Iterator[Grey]) -> None:
-    """Pictures as numbered PNG files."""
+def write(folder: Path, shots: Iterator[Grey], count: int, progress: Progress = silent) -> None:
+    """`count` pictures as numbered PNG files."""
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)
     for image_id, shot in enumerate(shots):
+        progress("rendering pictures", image_id, count)
         path = folder / file_name(image_id)
         if not cv2.imwrite(str(path), shot):
             raise OSError(0, "picture not written", str(path))

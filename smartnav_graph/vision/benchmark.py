@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Matches, Reference
 from smartnav_graph.timebase import NS, interpolate, seconds_since
 from smartnav_graph.vision.epipolar import rays, sampson
-from smartnav_graph.vision.front_end import FrontEndConfig, Progress, find
+from smartnav_graph.vision.front_end import FrontEndConfig, find
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -139,7 +140,7 @@ def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) 
     return np.where(weak, turned, epipolar) * focal_px <= TOLERANCE_PX, weak
 
 
-def score(session: Session, config: FrontEndConfig, *, workers: int = 0, progress: Progress | None = None) -> Score:
+def score(session: Session, config: FrontEndConfig, *, workers: int = 0, progress: Progress = silent) -> Score:
     """Match the session's pictures and compare with its reference.
 
     Raises
@@ -219,7 +220,7 @@ def compare(
     config: FrontEndConfig,
     *,
     workers: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> list[Score]:
     """`score` of several kinds of features, otherwise alike."""
     return [score(session, replace(config, features=name), workers=workers, progress=progress) for name in names]

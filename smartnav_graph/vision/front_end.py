@@ -10,7 +10,7 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Matches, Tracks
 from smartnav_graph.timebase import NS
@@ -30,8 +31,6 @@ from smartnav_graph.vision.images import Look, Picture
 from smartnav_graph.vision.matching import Pairing
 from smartnav_graph.vision.pool import ordered, threads
 from smartnav_graph.vision.tracking import Gyro, Tracker
-
-Progress = Callable[[str, int, int], None]
 
 KLT = "klt"
 POINTS, TRACKS = 1500, 300
@@ -100,7 +99,7 @@ class Found:
 
 
 def find(
-    session: Session, config: FrontEndConfig | None = None, *, workers: int = 0, progress: Progress | None = None
+    session: Session, config: FrontEndConfig | None = None, *, workers: int = 0, progress: Progress = silent
 ) -> Found:
     """Matches or tracks of a session's pictures.
 
@@ -121,7 +120,7 @@ def find(
     if not config.tracks:
         features.require(config.features)
     begin = time.perf_counter()
-    job = _Job(session, config, progress or (lambda stage, done, total: None))
+    job = _Job(session, config, progress)
     with threads(workers) as pool:
         found = job.tracks(pool) if config.tracks else job.matches(pool)
     return replace(found, report=replace(found.report, seconds=round(time.perf_counter() - begin, 3)))

@@ -18,10 +18,11 @@ import tomli_w
 from smartnav_graph import session as session_model
 from smartnav_graph.errors import SessionError
 from smartnav_graph.files import replacing
+from smartnav_graph.progress import Progress, silent
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Stream
 from smartnav_graph.vision import images
-from smartnav_graph.vision.front_end import Found, FrontEndConfig, Progress, asked, find
+from smartnav_graph.vision.front_end import Found, FrontEndConfig, asked, find
 from smartnav_graph.vision.front_end_report import FrontEndReport
 from smartnav_graph.vision.pool import ordered, threads
 
@@ -35,7 +36,7 @@ def match(
     *,
     force: bool = False,
     workers: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Found:
     """The matches or tracks of a session folder: those it keeps, where they were made alike, else made and kept.
 

@@ -1,0 +1,70 @@
+"""How far a long command is, on a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from smartnav_graph.progress import Progress, silent
+
+# Seconds between two drawings of the bar.
+PERIOD_S = 0.1
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Progress]:
+    """One line on stderr that says the stage, what is done of it, the rate and the time that is left; gone at the end.
+
+    Gives a function of stage, done and total (0: not known, then the time that has passed stands there). Not a byte is
+    written where stderr is no terminal.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"))
+    with Bar(*columns, console=Console(file=sys.stderr), transient=True, refresh_per_second=1 / PERIOD_S) as bar:
+        yield _Line(bar, bar.add_task("", total=None, told=""))
+
+
+class _Line:
+    """The line of the stage at hand."""
+
+    def __init__(self, bar: Any, task: Any) -> None:
+        self._bar, self._task = bar, task
+        self._stage, self._begun, self._drawn = "", 0.0, 0.0
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        now = time.perf_counter()
+        new = stage != self._stage
+        if new:
+            self._stage, self._begun = stage, now
+        elif now - self._drawn < PERIOD_S and done < total:
+            return
+        self._drawn = now
+        told = counted(done, total, now - self._begun) if total else ""
+        self._bar.update(self._task, description=stage, completed=done, total=total or None, told=told, refresh=new)
+
+
+def counted(done: int, total: int, seconds: float) -> str:
+    """What is done, how fast it goes and how long it still takes: ``120 of 505, 240/s, 2 s left``."""
+    if not done or seconds <= 0.0:
+        return f"{done} of {total}"
+    rate = done / seconds
+    return f"{done} of {total}, {rate:.3g}/s, {duration((total - done) / rate)} left"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: ``2 s``, ``3 min 05 s``, ``1 h 02 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
