@@ -53,3 +53,8 @@ _STATUS = {
 def of_status(value: str) -> list[int]:
     """The colour of a state on the time line."""
     return _STATUS.get(value, QUIET)
+
+
+def of_axes(count: int) -> list[list[int]]:
+    """Colours of so many lines that belong together; of one alone that of the estimate."""
+    return [ESTIMATE] if count == 1 else [AXES[k % 3] for k in range(count)]

@@ -41,7 +41,7 @@ def _log_lines(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: F
     import rerun as rr
 
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
-    recorder.style(path, rr.SeriesLines(colors=colours.AXES[: len(names)], names=names, widths=[1.0] * len(names)))
+    recorder.style(path, rr.SeriesLines(colors=colours.of_axes(len(names)), names=names, widths=[1.0] * len(names)))
 
 
 def log_bands(
@@ -57,7 +57,7 @@ def log_bands(
     """Lines with bands of one sigma, and at `path`/three_sigma of three: values and sigmas (n, k)."""
     import rerun as rr
 
-    colors = colors or colours.AXES[: len(names)]
+    colors = colors or colours.of_axes(len(names))
     for where, times, alpha in ((path, 1.0, 255), (f"{path}/three_sigma", 3.0, 120)):
         columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
         recorder.rows(where, t_ns, columns)
@@ -79,6 +79,8 @@ def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -
     log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s")
     _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"])
     _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg[:, None], ["heading"])
+    recorder.limits["/sigma/position"] = (0.0, 1.05 * float(np.nanmax(sigma[:, POS], initial=1e-3)))
+    recorder.limits["/sigma/heading"] = (0.0, 1.05 * float(np.nanmax(solution.sigma_heading_deg, initial=1e-3)))
     if evaluation is not None:
         _log_error(recorder, evaluation)
 
@@ -148,7 +150,7 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
             recorder.rows(path, t, rr.Scalars.columns(scalars=table))
             if len(t):
                 style = rr.SeriesPoints(
-                    colors=[colours.AXES[k % 3] if used else colours.REJECTED for k in range(width)],
+                    colors=colours.of_axes(width) if used else [colours.REJECTED] * width,
                     names=names,
                     markers=["circle" if used else "cross"] * width,
                     marker_sizes=[MARKER_SIZE if used else 2.5 * MARKER_SIZE] * width,
@@ -158,4 +160,4 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
 
 def axis_name(axis: int, width: int) -> str:
     """East, north, up of a position; the axis number of anything else."""
-    return ("east", "north", "up")[axis] if width == 3 else f"axis {axis}"
+    return ("east", "north", "up")[axis] if width == 3 else f"axis {axis}" if width > 1 else "residual"

@@ -17,7 +17,7 @@ from smartnav_graph.solution import POS, Solution
 
 Floats = NDArray[np.float64]
 
-MOST_ELLIPSOIDS = 600
+MOST_ELLIPSOIDS = 150
 MOST_PATH_POINTS = 50_000
 ELLIPSOID_SIGMAS = 3.0
 
