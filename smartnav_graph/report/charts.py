@@ -169,7 +169,7 @@ def _histogram(sensor: str, white: Floats) -> str:
     normal = np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi)
     y = axis([float(density.max(initial=0.0)), float(normal.max())], include=(0.0,), count=4)
     plot = Plot(exact_axis(-5.0, 5.0, step=1.0), y, f"Histogram of {sensor} residuals", height_px=150)
-    plot.y_title, plot.x_title = sensor_name(sensor), "Residual / sigma"
+    plot.y_title, plot.x_title = f"{sensor_name(sensor)}, density", "Residual / sigma"
     plot.bars(edges, density, "s4")
     plot.line(at, normal, "ink")
     far = int((np.abs(white) > 5.0).sum())

@@ -1,7 +1,10 @@
-"""The report in a real browser: quiet, offline, readable on a phone."""
+"""The report in a real browser: quiet, offline, readable on a phone, and its sentences those of summary.json."""
 
 from __future__ import annotations
 
+import csv
+import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,30 +15,35 @@ import numpy as np
 import pytest
 from drive_case import drive
 
+from smartnav_graph.cli import main
 from smartnav_graph.report import write_report
 
 CHROMIUM = shutil.which("chromium")
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 
-OVERLAPS = """() => [...document.querySelectorAll('svg.plot')].flatMap(plot => {
-  const boxes = [...plot.querySelectorAll('text.tick, text.title')].map(t => [t.textContent, t.getBoundingClientRect()])
-    .filter(([, r]) => r.width > 0);
-  return boxes.flatMap(([a, p], i) => boxes.slice(i + 1)
-    .filter(([, q]) => p.left < q.right && q.left < p.right && p.top < q.bottom && q.top < p.bottom)
-    .map(([b]) => plot.getAttribute('aria-label') + ': ' + a + ' / ' + b));
-})"""
-OUTSIDE = """() => [...document.querySelectorAll('svg.plot text')].filter(t => {
-  const r = t.getBoundingClientRect();
-  return r.width > 0 && (r.left < 0 || r.right > innerWidth); }).map(t => t.textContent)"""
-COVERED = """() => { const plots = [...document.querySelectorAll('svg.plot')];
-  return plots.slice(1).filter((p, i) => {
-    const low = Math.max(...[...plots[i].querySelectorAll('text.tick')].map(t => t.getBoundingClientRect().bottom));
-    const title = p.querySelector('text.ty0').getBoundingClientRect(), other = plots[i].getBoundingClientRect();
-    return other.left < title.right && title.left < other.right && title.top < low; })
-  .map(p => p.getAttribute('aria-label')); }"""
-SMALLEST = """() => Math.min(...[...document.querySelectorAll('svg.plot text.tick')].filter(t => t.getBBox().width > 0)
+LARGEST_BYTES = 3_000_000
+# Every piece of text on the page with its boxes (of each line), a pixel and a half smaller all round.
+TEXTS = """() => {
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+  for (let node; node = walker.nextNode();) {
+    if (!node.textContent.trim()) continue;
+    const svg = node.parentElement.closest('text');
+    const range = document.createRange(); range.selectNodeContents(node);
+    const boxes = svg ? [svg.getBoundingClientRect()] : [...range.getClientRects()];
+    for (const r of boxes) if (r.width > 3 && r.height > 3 && node.parentElement.checkVisibility())
+      found.push([node.textContent.trim().slice(0, 60), r.left + 1.5, r.top + 1.5, r.right - 1.5, r.bottom - 1.5]);
+  }
+  return found; }"""
+TITLES = """(cls) => [...document.querySelectorAll('svg.plot text.' + cls)].map(t => t.textContent)"""
+BARE = """() => [...document.querySelectorAll('section:not(#timeline) figure')].filter(f =>
+  f.querySelectorAll('text.tx0').length < 1 ||
+  f.querySelectorAll('svg.plot').length !== f.querySelectorAll('text.ty0').length)
+  .map(f => f.querySelector('svg.plot').getAttribute('aria-label'))"""
+SMALLEST = """() => Math.min(...[...document.querySelectorAll('svg.plot text')].filter(t => t.getBBox().width > 0)
   .map(t => parseFloat(getComputedStyle(t).fontSize)))"""
+WORDS = "id => document.getElementById(id).textContent.replaceAll('\\u202f', '').replace(/\\s+/g, ' ')"
+UNIT = re.compile(r"\[[^\]]+\]|sigma|density")
 
 
 @pytest.fixture(scope="module")
@@ -59,18 +67,67 @@ def far_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def kitti_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive of the gtsam wheel with outliers put in and every fifth fix kept back."""
+    folder = tmp_path_factory.mktemp("kitti")
+    session, faulty, run = (str(folder / name) for name in ("kitti", "faulty", "run"))
+    assert main(["import", "gtsam-kitti", "--out", session, "--quiet"]) == 0
+    assert main(["degrade", session, "--outliers", "isolated:0.06:50-200", "--seed", "5", "--out", faulty]) == 0
+    line = ["smooth", faulty, "--vehicle", "car", "--withhold", "gnss:every=2", "--to", "330", "--out", run, "--quiet"]
+    assert main(line) == 0
+    return folder / "run"
+
+
 @pytest.mark.parametrize("width", [1400, 390])
 def test_long_labels(browser: Any, far_page: Path, width: int) -> None:
-    look(browser, far_page, width, "light")
+    look(browser, far_page, width, "light").close()
 
 
 @pytest.mark.parametrize("width", [1400, 390])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_page(browser: Any, page: Path, width: int, scheme: str) -> None:
-    look(browser, page, width, scheme)
+    look(browser, page, width, scheme).close()
 
 
-def look(browser: Any, page: Path, width: int, scheme: str) -> None:
+@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_real_run(browser: Any, kitti_run: Path, width: int, scheme: str) -> None:
+    """What the page says in words is what summary.json and trajectory.csv hold."""
+    tab = look(browser, kitti_run / "report.html", width, scheme)
+    summary = json.loads((kitti_run / "summary.json").read_text(encoding="utf-8"))
+
+    holes = tab.evaluate("[...document.querySelectorAll('#imu-holes .hole')].map(h => h.textContent)")
+    told = [[float(x) for x in re.findall(r"([\d.]+) s", hole)] for hole in holes]
+    assert len(told) == 9
+    assert told == [[pytest.approx(g["start_s"], abs=0.05), pytest.approx(g["length_s"], abs=0.005)]
+                    for g in summary["gaps"]]  # fmt: skip
+
+    headline = tab.evaluate(WORDS, "headline")
+    rejected, withheld = summary["rejected"]["gnss"], summary["withheld"]["gnss"]["count"]
+    assert rejected >= 5 and withheld > 150
+    assert f"{rejected} GNSS fixes were rejected as outliers; the IMU record has 9 holes" in headline
+    assert f"{withheld} GNSS fixes were withheld from the estimate" in headline
+    cells = tab.evaluate("[...document.querySelectorAll('#used tr[data-sensor=gnss] td')].map(c => c.textContent)")
+    assert cells[2:4] == [str(rejected), str(withheld)]
+
+    with open(kitti_run / "trajectory.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    t = (np.array([int(row["t_ns"]) for row in rows]) - summary["session"]["t0_ns"]) / 1e9
+    e, n, u = (np.interp(300.0, t, [float(row[f"sigma_{axis}_m"]) for row in rows]) for axis in "enu")
+    said = re.search(
+        r"At t = 300 s the position is known to ([\d.]+) m \(1 sigma, horizontal\): "
+        r"([\d.]+) m east, ([\d.]+) m north, and ([\d.]+) m in height",
+        tab.evaluate(WORDS, "sigma-at"),
+    )
+    assert said is not None
+    assert [float(x) for x in said.groups()] == pytest.approx([np.hypot(e, n), e, n, u], abs=6e-4)  # m, as rounded
+    tab.close()
+
+
+def look(browser: Any, page: Path, width: int, scheme: str) -> Any:
+    """The page, once nothing is wrong with how it shows."""
+    assert page.stat().st_size <= LARGEST_BYTES
     said: list[str] = []
     asked: list[str] = []
     tab = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
@@ -81,10 +138,38 @@ def look(browser: Any, page: Path, width: int, scheme: str) -> None:
     assert said == []
     assert asked == [page.resolve().as_uri()]
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
-    assert tab.evaluate(OVERLAPS) == []
-    assert tab.evaluate(OUTSIDE) == []
-    assert tab.evaluate(COVERED) == []
+    texts = tab.evaluate(TEXTS)
+    assert overlaps(texts) == []
+    assert [t for t, left, _, right, _ in on_paper(tab, texts) if left < 0 or right > width] == []
+    assert tab.evaluate(BARE) == []
+    titles = tab.evaluate(TITLES, "tx0") + tab.evaluate(TITLES, "ty0")
+    assert [title for title in titles if not UNIT.search(title)] == []
     assert tab.evaluate(SMALLEST) >= 11.0  # px, legible
     light = tab.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)[0]")
     assert (light > 200) == (scheme == "light")
+    return tab
+
+
+def overlaps(texts: list[tuple[str, float, float, float, float]]) -> list[str]:
+    """Pairs of texts of which one covers part of the other."""
+    box = np.array([row[1:] for row in texts])
+    across = (box[:, None, 0] < box[None, :, 2]) & (box[None, :, 0] < box[:, None, 2])
+    along = (box[:, None, 1] < box[None, :, 3]) & (box[None, :, 1] < box[:, None, 3])
+    first, second = np.nonzero(np.triu(across & along, 1))
+    return [f"{texts[i][0]} / {texts[j][0]}" for i, j in zip(first, second, strict=True)]
+
+
+def on_paper(tab: Any, texts: list[Any]) -> list[Any]:
+    """The texts that do not stand in a box that scrolls by itself."""
+    inside = tab.evaluate(
+        "[...document.querySelectorAll('.scroll')].map(b => b.getBoundingClientRect()).map(r => [r.top, r.bottom])"
+    )
+    return [t for t in texts if not any(top <= t[2] <= bottom for top, bottom in inside)]
+
+
+def test_the_rule_sees_an_overlap(browser: Any) -> None:
+    tab = browser.new_page()
+    drawn = "<text y='20'>four</text><text y='24'>five</text><text y='60'>six</text>"
+    tab.set_content(f"<p>one</p><p style='margin-top:-30px'>two</p><p>three</p><svg>{drawn}</svg>")
+    assert overlaps(tab.evaluate(TEXTS)) == ["one / two", "four / five"]
     tab.close()
