@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from smartnav_graph.progress import Progress, silent
@@ -30,7 +31,7 @@ def progress(quiet: bool) -> Iterator[Progress]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"))
     with Bar(*columns, console=Console(file=sys.stderr), transient=True, refresh_per_second=1 / PERIOD_S) as bar:
-        yield _Line(bar, bar.add_task("", total=None, told=""))
+        yield _Line(bar, bar.add_task("", total=None, visible=False, told=""))
 
 
 class _Line:
@@ -48,8 +49,23 @@ class _Line:
         elif now - self._drawn < PERIOD_S and done < total:
             return
         self._drawn = now
-        told = counted(done, total, now - self._begun) if total else ""
-        self._bar.update(self._task, description=stage, completed=done, total=total or None, told=told, refresh=new)
+        told, whole = _Told(done, total, self._begun), total or None
+        self._bar.update(
+            self._task, description=stage, completed=done, total=whole, told=told, visible=True, refresh=new
+        )
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What stands behind the bar, at the moment it is drawn: of a stage of unknown length the time it has taken."""
+
+    done: int
+    total: int
+    begun: float
+
+    def __str__(self) -> str:
+        passed = time.perf_counter() - self.begun
+        return counted(self.done, self.total, passed) if self.total else duration(passed)
 
 
 def counted(done: int, total: int, seconds: float) -> str:
@@ -57,7 +73,8 @@ def counted(done: int, total: int, seconds: float) -> str:
     if not done or seconds <= 0.0:
         return f"{done} of {total}"
     rate = done / seconds
-    return f"{done} of {total}, {rate:.3g}/s, {duration((total - done) / rate)} left"
+    speed = f"{rate:.0f}" if rate >= 100 else f"{rate:.3g}"
+    return f"{done} of {total}, {speed}/s, {duration((total - done) / rate)} left"
 
 
 def duration(seconds: float) -> str:
