@@ -15,6 +15,9 @@ two-view          one pair of 300 matches, 30 % wrong, to kind, pose and covaria
                   OpenCV's findEssentialMat and recoverPose alone
 vision-solve      what image pairs cost a batch run of 20 min (pairs of 50 matches at 1.54 Hz) beyond the same run
                   without images; baseline: scripts/bare_vision_solve.py, CustomFactors in GTSAM's own optimiser
+recording-37min   run.rrd of the simulated drive of 37 min (222 000 inertial samples), with identity, layout and factor
+                  graph; beside it the same with 2000 JPEG pictures; baseline: scripts/bare_recording.py, Rerun's own
+                  send_columns of the same arrays
 """
 
 from __future__ import annotations
@@ -74,6 +77,11 @@ def bare_two_view() -> Measured:
     return Measured(told.pop("seconds"), None, told)
 
 
+def bare_recording(session: str, run: str, file: str) -> Measured:
+    told = python(str(HERE / "bare_recording.py"), session, run, file)
+    return Measured(told.pop("seconds"), None, told)
+
+
 def bare_vision_solve(session: str) -> Measured:
     told = python(str(HERE / "bare_vision_solve.py"), "solve", session)
     return Measured(told["seconds"], None, told)
@@ -91,6 +99,9 @@ def measure(kind: str, path: str) -> None:
         return
     if kind == "two-view":
         measure_two_view()
+        return
+    if kind.startswith("recording"):
+        measure_recording(Path(path), with_pictures=kind.endswith("pictures"))
         return
     import smartnav_graph as sn
     from smartnav_graph import estimate  # imports are not measured
@@ -170,6 +181,51 @@ def measure_two_view() -> None:
     tell(figures.pop("seconds"), figures)
 
 
+def measure_recording(path: Path, *, with_pictures: bool) -> None:
+    """In the fresh process: the recording of a run in memory, written."""
+    import rerun  # noqa: F401  imports are not measured
+
+    import smartnav_graph as sn
+    from smartnav_graph import estimate
+    from smartnav_graph.rerun_log import write_recording
+
+    session = sn.load(path)
+    run = estimate.smooth(session)
+    if with_pictures:
+        session = pictured(session, path.parent / "jpeg", count=2000)
+    with tempfile.TemporaryDirectory() as folder:
+        file, begin, cpu = Path(folder) / "run.rrd", time.perf_counter(), time.process_time()
+        write_recording(file, session=session, solution=run.solution, summary=run.summary, trace=run.trace)
+        cpu = time.process_time() - cpu
+        detail = {"wall_s": round(time.perf_counter() - begin, 4), "size_mb": round(file.stat().st_size / 1e6, 2)}
+    detail |= {"samples": len(session.require_imu()), "keyframes": len(run.solution)}
+    detail |= {"pictures": 0 if session.images is None else len(session.images)}
+    tell(cpu, detail)
+
+
+def pictured(session: Any, folder: Path, count: int) -> Any:
+    """The session with textured JPEG pictures of 640 x 480 spread over it."""
+    import cv2
+    import numpy as np
+    from bare_front_end import make
+
+    from smartnav_graph.streams import Images
+
+    if not folder.exists():
+        make(folder, 20)
+        for picture in sorted(folder.glob("*.png")):
+            cv2.imwrite(str(picture.with_suffix(".jpg")), cv2.imread(str(picture)))
+    names = sorted(file.name for file in folder.glob("*.jpg"))
+    imu = session.require_imu()
+    images = Images(
+        t_ns=np.linspace(imu.t_ns[0], imu.t_ns[-1], count).astype(np.int64),
+        image_id=np.arange(count),
+        file=np.array([names[k % len(names)] for k in range(count)], dtype=object),
+        camera=np.full(count, "cam0", dtype=object),
+    )
+    return session.replace(images=images, pictures=folder)
+
+
 def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
     """A simulated session on disk; a process of its own, so that it costs no memory here."""
     path = folder / f"{scenario}{'' if sigmas else '-without-sigmas'}"
@@ -181,6 +237,17 @@ def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
             "sn.save(s, sys.argv[2])"
         )
         subprocess.run([sys.executable, "-c", code, scenario, str(path), str(sigmas)], check=True)
+    return str(path)
+
+
+def make_run(session: str, folder: Path) -> str:
+    """A run on disk, without report and recording."""
+    path = folder / "run"
+    code = (
+        "import sys, smartnav_graph as sn; from smartnav_graph import run_folder\n"
+        "run_folder.write_run(sn.run(sn.load(sys.argv[1])), sys.argv[2], report=False, recording=False)"
+    )
+    subprocess.run([sys.executable, "-c", code, session, str(path)], check=True)
     return str(path)
 
 
@@ -216,6 +283,11 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
         return lambda: ours("vision", trolley), lambda: bare_vision_solve(trolley), {}
     if name == "two-view":
         return lambda: ours("two-view", "simulated"), bare_two_view, {}
+    if name == "recording-37min":
+        drive = make_session(f"car-{MINUTES}min", folder)
+        run, file = make_run(drive, folder), str(folder / "bare.rrd")
+        beside = {"with_2000_pictures": lambda: ours("recording-pictures", drive)}
+        return lambda: ours("recording", drive), lambda: bare_recording(drive, run, file), beside
     return lambda: ours("replay", "gtsam-kitti"), bare_fixed_lag, {}
 
 
@@ -225,7 +297,9 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
     rounds = [(job(), baseline()) for _ in range(repeat)]
     found, base = (middle(list(column)) for column in zip(*rounds, strict=True))
     detail: dict[str, Any] = {"job": found.detail, "baseline": base.detail, "repeat": repeat}
-    detail |= {label: middle([other() for _ in range(min(repeat, 3))]).seconds for label, other in beside.items()}
+    for label, other in beside.items():
+        told = middle([other() for _ in range(min(repeat, 3))])
+        detail[label] = told.seconds if label.startswith("bare") else {"seconds": told.seconds, **told.detail}
     return {
         "name": name,
         "seconds": round(found.seconds, 5),
@@ -238,7 +312,7 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
 
 NAMES = (
     *("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag"),
-    *("vision-frontend", "two-view", "vision-solve"),
+    *("vision-frontend", "two-view", "vision-solve", "recording-37min"),
 )
 
 

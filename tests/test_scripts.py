@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import smartnav_graph as sn
+from smartnav_graph.run_folder import write_run
 
 ROOT = Path(__file__).parents[1]
 
@@ -102,3 +103,17 @@ def test_two_view_geometry_is_measured_beside_bare_opencv():
     runs = [subprocess.run([sys.executable, *c], capture_output=True, text=True, check=True) for c in commands]
     ours, bare = json.loads(runs[0].stdout)["detail"], json.loads(runs[1].stdout)
     assert ours["rotation_deg"] < bare["rotation_deg"] and ours["direction_deg"] < 0.8 * bare["direction_deg"]
+
+
+def test_a_recording_is_measured_beside_bare_rerun(tmp_path):
+    scripts, session, run = ROOT / "scripts", tmp_path / "eight", tmp_path / "run"
+    sn.save(sn.simulate("figure-eight-60s"), session)
+    write_run(sn.run(sn.load(session)), run, report=False, recording=False)
+    commands = [
+        [scripts / "benchmark.py", "--measure", "recording", session],
+        [scripts / "bare_recording.py", session, run, tmp_path / "bare.rrd"],
+    ]
+    runs = [subprocess.run([sys.executable, *c], capture_output=True, text=True, check=True) for c in commands]
+    ours, bare = json.loads(runs[0].stdout)["detail"], json.loads(runs[1].stdout)
+    assert ours["samples"] == 6000 and ours["keyframes"] == 62 and ours["pictures"] == 0
+    assert 0.3 < bare["size_mb"] < ours["size_mb"]  # the same arrays, and more

@@ -60,7 +60,7 @@ def log_graph(recorder: Recorder, trace: Trace) -> None:
         positions=places,
         colors=np.array([color for picture in pictures for color in picture.colors], dtype=np.uint8),
     )
-    edges = rr.GraphEdges.columns(edges=[edge for picture in pictures for edge in picture.edges])
+    edges = rr.GraphEdges.columns(edges=np.array([edge for picture in pictures for edge in picture.edges]))
     recorder.rows("/graph", times, nodes.partition([len(picture.ids) for picture in pictures]))
     recorder.rows("/graph", times, edges.partition([len(picture.edges) for picture in pictures]))
     recorder.bounds["/graph"] = np.stack([places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN])
