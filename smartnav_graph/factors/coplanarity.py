@@ -46,9 +46,10 @@ POSE_DOF = 5
 class CoplanarityConfig:
     """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
     least_parallax : of a pair (median once the turn is taken out), in sigmas of a match: noise alone makes 1.7; reach :
-    of the Cauchy loss of a match, sigmas; compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's
-    attitude in the body and of its clock as states (zero: known; none given: as sure as the calibration says);
-    row_time : points are taken as seen when the row they lie in was read, where the camera's readout is known."""
+    of the Cauchy loss of a match, sigmas; compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma
+    : deg and s, priors of the camera's attitude in the body and of its clock as states (zero: known; none given: as
+    sure as the calibration says); row_time : points are taken as seen when the row they lie in was read, where the
+    camera's readout is known."""
 
     enabled: bool = True
     rate_hz: float = 4.0
