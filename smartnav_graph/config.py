@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from smartnav_graph.factors.step import StepConfig
 from smartnav_graph.factors.vehicle import VehicleConfig
 from smartnav_graph.factors.velocity import VelocityConfig
 from smartnav_graph.factors.wheel import WheelConfig
+from smartnav_graph.files import read_toml
 from smartnav_graph.keyframes import KeyframeConfig
 from smartnav_graph.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
@@ -146,13 +146,7 @@ def load(path: str | Path) -> Config:
     ConfigError
         Missing or unreadable file, or what `from_dict` finds.
     """
-    path = Path(path)
-    try:
-        return from_dict(tomllib.loads(path.read_text(encoding="utf-8")), path)
-    except OSError as error:
-        raise ConfigError(path, f"cannot be read ({error.strerror})", "a config.toml") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(path, f"is no TOML ({error})", "a config.toml") from error
+    return from_dict(read_toml(Path(path), ConfigError, "a config.toml"), path)
 
 
 def dumps(config: Config) -> str:

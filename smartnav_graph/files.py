@@ -1,15 +1,27 @@
-"""Writing that never leaves a half-written file in place of a good one."""
+"""Reading what people write by hand, and writing that never leaves a half-written file in place of a good one."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.errors import SessionError, SmartnavError
+
+
+def read_toml(path: Path, fault: type[SmartnavError], what: str) -> dict[str, Any]:
+    """The tables of a TOML file; `what` it should be (``a config.toml``) is part of the `fault` raised otherwise."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise fault(path, f"cannot be read ({error.strerror})", what) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise fault(path, f"is no TOML ({error})", what) from error
 
 
 def refuse_existing(path: Path, force: bool) -> None:

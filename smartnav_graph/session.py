@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +20,7 @@ from smartnav_graph import frames, repair
 from smartnav_graph.calibration import model as calibration_model
 from smartnav_graph.calibration.model import Calibration
 from smartnav_graph.errors import CalibrationError, SessionError
-from smartnav_graph.files import replacing
+from smartnav_graph.files import read_toml, replacing
 from smartnav_graph.frames import LocalFrame, Origin
 from smartnav_graph.progress import Progress, silent, watched
 from smartnav_graph.streams import (
@@ -312,16 +311,9 @@ def build_stream(
 def read_header(folder: Path) -> dict[str, Any]:
     """session.toml as keyword arguments of Session (without streams)."""
     path = folder / "session.toml"
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SessionError(
-            folder, "holds no session.toml", "a session folder", "make one with `smartnav import`"
-        ) from error
-    except OSError as error:
-        raise SessionError(path, f"cannot be read ({error.strerror})", "a readable session.toml") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SessionError(path, f"is no TOML ({error})", "a session.toml") from error
+    if not path.exists():
+        raise SessionError(folder, "holds no session.toml", "a session folder", "make one with `smartnav import`")
+    raw = read_toml(path, SessionError, "a session.toml")
     known = {"schema", "device", "clock", "origin", "gravity_m_s2", "sensors", "calibration", "repair"}
     unknown = sorted(set(raw) - known)
     if unknown:

@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 
 # From the ground up. A room is a module or a folder of modules.
 ORDER = (
-    *("errors", "progress", "timebase", "frames", "streams", "calibration", "files", "repair", "session"),
+    *("errors", "progress", "timebase", "frames", "files", "streams", "calibration", "repair", "session"),
     *("health", "steps", "standstill"),
     *("readers", "simulation", "vision"),
     *("solution", "losses", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ import tomli_w
 
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import CalibrationError
+from smartnav_graph.files import read_toml
 
 
 @dataclass(frozen=True)
@@ -228,13 +228,7 @@ def load(path: str | Path) -> Calibration:
     CalibrationError
         Missing or unreadable file, unknown key, or a value that is not > 0.
     """
-    path = Path(path)
-    try:
-        return from_dict(tomllib.loads(path.read_text(encoding="utf-8")), path)
-    except OSError as error:
-        raise CalibrationError(path, f"cannot be read ({error.strerror})", "a calibration.toml") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(path, f"is no TOML ({error})", "a calibration.toml") from error
+    return from_dict(read_toml(Path(path), CalibrationError, "a calibration.toml"), path)
 
 
 def dumps(calibration: Calibration) -> str:

@@ -11,7 +11,6 @@ session             a folder with reference.parquet, or that file
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.files import read_toml
 from smartnav_graph.readers.source import Columns, vector_columns
-from smartnav_graph.readers.text import TextTable, first_lines, read_bytes, read_text
+from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session import build_stream, read_table
 from smartnav_graph.streams import Reference
 from smartnav_graph.timebase import NS
@@ -226,10 +226,7 @@ def load_transform(path: str | Path) -> Floats:
     SessionError
         Missing or unreadable file, no such key, or no rotation and translation.
     """
-    try:
-        raw = tomllib.loads(read_bytes(Path(path)).decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SessionError(path, f"is no TOML ({error})", "a key body_T_<frame> with four rows of four") from error
+    raw = read_toml(Path(path), SessionError, "a TOML file with a key body_T_<frame>, four rows of four")
     keys = [key for key in raw if key.startswith("body_T_")]
     try:
         matrix = np.array(raw[keys[0]], dtype=np.float64)
