@@ -30,7 +30,7 @@ SCENARIO, PERIOD_S, MATCHES = "trolley-20min", 0.65, 50
 
 def make(folder: str) -> None:
     scenario = SCENARIOS[SCENARIO]
-    camera = replace(scenario.camera, rate_hz=1.0 / PERIOD_S, count=(MATCHES, MATCHES))
+    camera = replace(scenario.camera, rate_hz=1.0 / PERIOD_S, count=(MATCHES, MATCHES), pairs=(1,))
     sn.save(replace(scenario, camera=camera)(0), folder, force=True)
 
 
