@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph import frames
-from smartnav_graph.rerun_log import signals
+from smartnav_graph.rerun_log import colours, signals
 from smartnav_graph.rerun_log.cameras import CameraView
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.rerun_log.spatial import Extent, nice
@@ -171,7 +171,7 @@ def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) ->
             visible=True,
             spacing=nice(extent.size / 10),
             plane=rr.components.Plane3D.XY.with_distance(extent.floor),
-            color=[255, 255, 255, 40],
+            color=colours.GRID,
         ),
         eye_controls=rrb.EyeControls3D(
             position=eye_position(extent, direction, np.array(up)), look_target=extent.centre, eye_up=up

@@ -1,11 +1,11 @@
-"""Colours (red, green, blue) that stay apart on the viewer's dark ground."""
+"""Colours (red, green, blue) that stay apart on the viewer's dark ground and on its light one."""
 
 from __future__ import annotations
 
 AXES = [[235, 80, 80], [90, 200, 100], [90, 150, 255]]
 ESTIMATE = [90, 160, 255]
-CAUSAL = [240, 225, 90]
-REFERENCE = [200, 200, 200]
+CAUSAL = [225, 180, 20]
+REFERENCE = [150, 150, 150]
 FIX = [80, 200, 120]
 REJECTED = [255, 60, 60]
 WITHHELD = [190, 130, 255]
@@ -13,15 +13,16 @@ POSE_FIX = [60, 210, 210]
 CONTROL = [255, 130, 200]
 COVARIANCE = [255, 150, 40]
 VELOCITY = [120, 230, 120]
-BODY = [255, 255, 255]
+BODY = [225, 70, 225]
 QUIET = [110, 110, 110]
 # Twelve hues for tracks, told apart by number.
 TRACKS = [
     *([230, 80, 80], [240, 150, 60], [240, 210, 70], [170, 210, 80], [90, 200, 100], [70, 200, 170]),
     *([80, 200, 230], [90, 150, 255], [140, 120, 250], [200, 110, 240], [240, 110, 200], [200, 200, 200]),
 ]
-CAMERA = [230, 230, 230]
-WINDOW = [255, 255, 255]
+CAMERA = [150, 150, 150]
+WINDOW = [225, 70, 225]
+GRID = [128, 128, 128, 70]
 # States of the graph, by letter, and factors, by what they rest on.
 STATES = {"X": [90, 160, 255], "V": [120, 230, 120], "B": [255, 170, 60]}
 _BUILDERS = {
@@ -30,8 +31,8 @@ _BUILDERS = {
     "gnss": FIX,
     "control": CONTROL,
     "pose_fixes": POSE_FIX,
-    "coplanarity": [240, 225, 90],
-    "prior": [200, 200, 200],
+    "coplanarity": CAUSAL,
+    "prior": REFERENCE,
 }
 MATCH, OUTLIER, UNUSED, NEUTRAL = [90, 220, 120], [255, 70, 70], [240, 180, 70], [150, 200, 255]
 

@@ -134,13 +134,22 @@ class Recorder:
         if not (np.isfinite(low).any() and np.isfinite(high).any()):
             return
         bottom, top = float(np.nanpercentile(low, 0.5)), float(np.nanpercentile(high, 99.5))
-        margin = 0.05 * (top - bottom)
-        if margin > 0:
-            self.limits[path] = (bottom - margin, top + margin)
+        if top > bottom:
+            self.limits[path] = readable(bottom, top)
 
     def has(self, prefix: str) -> bool:
         """Whether this entity, or one below it, holds data."""
         return any(path == prefix or path.startswith(prefix + "/") for path in self.paths)
+
+
+def readable(low: float, high: float) -> tuple[float, float]:
+    """A value range with a margin, in which two numbers stand at the axis: a small plot has them at powers of ten."""
+    low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
+    step = 10.0 ** np.ceil(np.log10((high - low) / 4.0))
+    if np.floor(high / step) - np.ceil(low / step) >= 1:
+        return low, high
+    up, down = np.ceil(high / step) * step, np.floor(low / step) * step
+    return (low, float(up)) if up - high <= low - down else (float(down), high)
 
 
 @contextmanager

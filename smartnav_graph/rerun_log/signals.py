@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.rerun_log import colours
 from smartnav_graph.rerun_log.events import stops
-from smartnav_graph.rerun_log.recorder import Recorder
+from smartnav_graph.rerun_log.recorder import Recorder, readable
 from smartnav_graph.session import Session
 from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solution
 
@@ -58,13 +58,13 @@ def log_bands(
     import rerun as rr
 
     colors = colors or colours.of_axes(len(names))
-    for where, times, alpha in ((path, 1.0, 255), (f"{path}/three_sigma", 3.0, 120)):
+    for where, times in ((path, 1.0), (f"{path}/three_sigma", 3.0)):
         columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
         recorder.rows(where, t_ns, columns)
         style = rr.Measurements.from_fields(
             names=names,
             units=[unit] * len(names),
-            colors=[[*color, alpha] for color in colors],
+            colors=colors,
             widths=[1.5 if times == 1.0 else 0.0] * len(names),
         )
         recorder.style(where, style)
@@ -79,8 +79,8 @@ def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -
     log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s")
     _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"])
     _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg[:, None], ["heading"])
-    recorder.limits["/sigma/position"] = (0.0, 1.05 * float(np.nanmax(sigma[:, POS], initial=1e-3)))
-    recorder.limits["/sigma/heading"] = (0.0, 1.05 * float(np.nanmax(solution.sigma_heading_deg, initial=1e-3)))
+    recorder.limits["/sigma/position"] = readable(0.0, float(np.nanmax(sigma[:, POS], initial=1e-3)))
+    recorder.limits["/sigma/heading"] = readable(0.0, float(np.nanmax(solution.sigma_heading_deg, initial=1e-3)))
     if evaluation is not None:
         _log_error(recorder, evaluation)
 

@@ -23,9 +23,9 @@ _LEGEND = {
     "/world/causal/path": "**yellow line**, the estimate when each keyframe became known",
     "/world/causal/now": "**yellow point**, the estimate that the chosen time had of itself",
     "/world/causal/covariance": "**yellow, filled**, its 3σ ellipsoid, true size",
-    "/world/causal/window": "**white line**, the window: what the update of the chosen time could still correct, "
+    "/world/causal/window": "**magenta line**, the window: what the update of the chosen time could still correct, "
     "as it left it",
-    "/world/reference/path": "**thin light line**, the reference",
+    "/world/reference/path": "**thin grey line**, the reference",
     "/world/gnss/fixes": "**green points**, GNSS fixes; large: the latest one",
     "/world/gnss/withheld": "**violet points**, fixes that are not in the solution (withheld, or outside it)",
     "/world/gnss/rejected": "**red points**, rejected fixes",

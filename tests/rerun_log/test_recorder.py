@@ -105,3 +105,16 @@ def test_importing_the_package_does_not_load_rerun():
     code = "import sys, smartnav_graph, smartnav_graph.rerun_log; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (-1.0, 2.0, (-1.09, 2.09)),  # -1 to 2: four numbers
+        (0.0, 0.07, (-0.0021, 0.1)),  # 0 and 0.1 instead of 0 alone
+        (-0.061, 0.04, (-0.1, 0.04303)),
+        (9.79, 9.82, (9.7891, 9.8209)),  # 9.79 to 9.82
+    ],
+)
+def test_a_small_plot_has_two_numbers_at_its_axis(low, high, expected):
+    assert recorder.readable(low, high) == pytest.approx(expected)
