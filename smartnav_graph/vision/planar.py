@@ -27,6 +27,7 @@ from smartnav_graph.vision.refine import (
     minimise,
     transfer,
 )
+from smartnav_graph.vision.uncertainty import UNKNOWNS, Other, inverse
 
 Floats = NDArray[np.float64]
 
@@ -37,10 +38,10 @@ CLEARLY_BETTER = 9.0  # difference of squared misses, 3 sigmas
 
 
 class PlanarFit(NamedTuple):
-    """Pose with its plane; `twin`: another pose explains the plane and all the rest as well."""
+    """Pose with its plane; `others` explain the plane and all the rest as well."""
 
     fit: Fit
-    twin: bool
+    others: list[Other]
 
 
 def fit_plane(
@@ -90,9 +91,15 @@ def _poses(H: Floats, matched: Matched) -> list[tuple[Floats, Floats, Floats]]:
 def _chosen(fits: list[Fit], matched: Matched) -> PlanarFit:
     """Of the poses of a plane the one that what lies off the plane, or the prior, speaks for; else the smaller turn."""
     costs = [2.0 * fit.cost + _off_plane(fit, matched) for fit in fits]
-    alike = [fit for fit, cost in zip(fits, costs, strict=True) if cost < min(costs) + CLEARLY_BETTER]
-    best = min(alike, key=lambda fit: angle(fit.state[0]))
-    return PlanarFit(best, any(angle(best.state[0].T @ fit.state[0]) > TURNED for fit in alike))
+    alike = [(fit, cost) for fit, cost in zip(fits, costs, strict=True) if cost < min(costs) + CLEARLY_BETTER]
+    best, least = min(alike, key=lambda one: angle(one[0].state[0]))
+    others = []
+    for fit, cost in alike:
+        known = inverse(fit.information)
+        if known is not None and angle(best.state[0].T @ fit.state[0]) > TURNED:
+            R, t, _ = fit.state
+            others.append(Other(R, t, known[:UNKNOWNS, :UNKNOWNS], 0.5 * (cost - least)))
+    return PlanarFit(best, others)
 
 
 def _off_plane(fit: Fit, matched: Matched) -> float:

@@ -14,8 +14,8 @@ c0_R_c1, c0_t_c1: X0 = c0_R_c1 X1 + baseline c0_t_c1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from smartnav_graph.errors import ConfigError, SessionError
 from smartnav_graph.vision.consensus_pair import LEAST, OPTICAL_AXIS, Pose, colmap, directions, magsac, turns
-from smartnav_graph.vision.parallax import faced, in_front, parallax
-from smartnav_graph.vision.planar import fit_plane
+from smartnav_graph.vision.parallax import CLEAR, faced, in_front, parallax
+from smartnav_graph.vision.planar import CLEARLY_BETTER, PlanarFit, fit_plane
 from smartnav_graph.vision.refine import (
     GATE_SQUARE,
     REACH,
@@ -36,11 +36,12 @@ from smartnav_graph.vision.refine import (
     RotationPrior,
     State,
     Turn,
+    angle,
     minimise,
     transfer,
 )
 from smartnav_graph.vision.selection import Explained, by_chance, choose, hardly_moves, stands_still
-from smartnav_graph.vision.uncertainty import covariance
+from smartnav_graph.vision.uncertainty import Other, covariance, shared, shares
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -60,6 +61,13 @@ SETTLING = 5  # rounds of inliers and least squares
 LARGEST_SAY, TIMES_THE_MEAN = 0.3, 4.0  # of one match in the pose; the mean say is unknowns / matches
 TURNING = 6  # iterations that a rotation needs if there is no more to it
 TRIED = 3  # iterations that show which start is the best
+# Direction (rad) known worse than this: other baselines are looked for, across the picture and ahead; angle by which
+# they are others (their rotations a tenth of it); iterations that this may take, and cost after the first at which to
+# go on; share of others that is told in words.
+WEAK_DIRECTION, ELSEWHERE, LOOKING, WORTHLESS, WORTH_A_WORD = 0.04, 0.35, 8, 30.0, 0.05
+_ELSEWHERE = [np.array([math.cos(a), math.sin(a), 0.0]) for a in np.pi * np.arange(4) / 4] + [OPTICAL_AXIS]
+TWIN = "another pose explains the plane as well; the smaller rotation was taken"
+AMBIGUOUS = "another pose explains the matches about as well"
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,8 @@ class TwoView:
     kind : static | rotation | planar | general | failed; reason : in words, where there is something to say
     c0_R_c1 (3, 3); c0_t_c1 (3,) unit direction of the baseline, zero where there is none
     covariance (5, 5) : [rotation rad, c0_R_c1 Exp(w); direction, unit(c0_t_c1 + B d)], B = `tangent_basis(c0_t_c1)`;
-        infinite variances of what is not known
+        infinite variances of what is not known; where another pose explains the matches as well (see reason), the
+        second moment of both. That of a rotation holds if there is no baseline: one too short to show would turn it
     inliers (m,) : matches the geometry explains
     chi2_per_dof : of the inliers, and of the prior where there is one; NaN if failed
     parallax_rad : median angle between the inliers' rays once the rotation is taken out; NaN if failed
@@ -140,11 +149,12 @@ def _moved(matched: Matched, method: str, prior: RotationPrior | None, seed: int
         models["planar"] = _explained(plane.fit, prior)
     kind = choose(models)
     if kind == "planar" and plane is not None:
-        reason = "another pose explains the plane as well; the smaller rotation was taken" if plane.twin else ""
-        return _told("planar", reason, matched, plane.fit.state, prior)
+        return _besides(_told("planar", "", matched, plane.fit.state, prior), plane.others, TWIN)
     if kind == "general":
         R, t = faced(matched.only(general.square < GATE_SQUARE[1]), *general.state, known_rotation=prior is not None)
-        return _told("general", "", matched, (R, t), prior)
+        told = _told("general", "", matched, (R, t), prior)
+        near = turn.state[0] if prior is None else prior.c0_R_c1
+        return _besides(told, [] if told.kind == "failed" else _others(matched, told, plane, near, prior), AMBIGUOUS)
     at_rest = kind == "static" or hardly_moves(still[turn.square < GATE_SQUARE[2]])
     return _told("static" if at_rest else "rotation", "", matched, turn.state, prior)
 
@@ -185,6 +195,57 @@ def _deviation(R: Floats, prior: RotationPrior | None) -> float:
 
 def _explained(fit: Fit, prior: RotationPrior | None) -> Explained:
     return Explained(fit.square, _deviation(fit.state[0], prior))
+
+
+def _others(
+    matched: Matched, told: TwoView, plane: PlanarFit | None, near: Floats, prior: RotationPrior | None
+) -> list[Other]:
+    """General poses of about the same cost that are not the one told: the two of a plane, and where little parallax
+    leaves the direction weak, other baselines, or the same the other way round."""
+    taken: State = (told.c0_R_c1, told.c0_t_c1)
+    model = Epipolar(matched)
+    cost = minimise(model, taken, reach=REACH, prior=prior, iterations=1).cost
+    starts: list[State] = [] if plane is None else [plane.fit.state[:2], *((one.R, one.t) for one in plane.others)]
+    found: list[Other] = []
+    if np.linalg.eigvalsh(told.covariance[3:, 3:])[-1] > WEAK_DIRECTION**2:
+        starts += [(near, t) for t in _ELSEWHERE]
+        found += _backwards(matched.only(told.inliers), told)
+    known: list[State] = [taken]
+    for start in starts:
+        fit = minimise(model, start, reach=REACH, prior=prior, iterations=TRIED)
+        if fit.cost - cost > WORTHLESS or any(_alike(fit.state, pose) for pose in known):
+            continue
+        fit = minimise(model, fit.state, reach=REACH, prior=prior, iterations=LOOKING)
+        if fit.cost - cost < 0.5 * CLEARLY_BETTER and not any(_alike(fit.state, pose) for pose in known):
+            known.append(fit.state)
+            R, t = faced(matched.only(fit.square < GATE_SQUARE[1]), *fit.state, known_rotation=prior is not None)
+            there = minimise(model, (R, t), reach=REACH, prior=prior, iterations=1)
+            spread = covariance("general", matched, there, prior)
+            found += [] if spread is None else [Other(*there.state, spread, there.cost - cost)]
+    return found
+
+
+def _alike(one: State, other: State) -> bool:
+    """Whether two poses are one, but for the sign of the baseline."""
+    return angle(one[0].T @ other[0]) < ELSEWHERE / 10.0 and abs(float(one[1] @ other[1])) > math.cos(ELSEWHERE)
+
+
+def _backwards(inliers: Matched, told: TwoView) -> list[Other]:
+    """The same baseline the other way round, if the points do not clearly lie in front: those that do would have to be
+    infinitely far away."""
+    votes = in_front(inliers, told.c0_R_c1, told.c0_t_c1)
+    behind = 0.5 * CLEAR**2 * float((np.sign(votes) * votes**2).sum())
+    if behind >= 0.5 * CLEARLY_BETTER:
+        return []
+    return [Other(told.c0_R_c1, -told.c0_t_c1, told.covariance, behind)]
+
+
+def _besides(told: TwoView, others: Sequence[Other], reason: str) -> TwoView:
+    """What is told of a pose that others come near to."""
+    if not others or told.kind == "failed":
+        return told
+    spread = shared(told.covariance, (told.c0_R_c1, told.c0_t_c1), others)
+    return replace(told, covariance=spread, reason=reason if sum(shares(others)) > WORTH_A_WORD else "")
 
 
 def _told(kind: Kind, reason: str, matched: Matched, state: State, prior: RotationPrior | None) -> TwoView:

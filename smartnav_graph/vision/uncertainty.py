@@ -8,22 +8,41 @@ general pose is the mean over the poses around the fit that are as probable as t
 
 It is honest where the direction is known to about 0.2 rad; beyond, no Gaussian on a tangent plane tells the truth.
 
+Where other poses x_j = x (+) d_j of covariance C_j explain the matches about as well, with a share p_j of the
+probability, what is told is the second moment of them all about the one that was taken,
+
+    (1 - sum_j p_j) C + sum_j p_j (C_j + d_j d_j^T)
+
 Source: Julier, Uhlmann (1997), A new extension of the Kalman filter to nonlinear systems (the symmetric points).
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.vision.epipolar import sampson
-from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, shifted, tangent_basis
+from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, State, rotation_vector, shifted, tangent_basis
 
 Floats = NDArray[np.float64]
 
 UNKNOWNS = 5
 LARGEST_CONDITION = 1e10  # of the scaled information: more is a direction the matches leave open
+
+
+class Other(NamedTuple):
+    """Another pose that explains the matches: c0_R_c1, c0_t_c1, their covariance (5, 5), and by how much of the cost
+    (half the squared misses) it is behind the one taken; negative where it is ahead."""
+
+    R: Floats
+    t: Floats
+    covariance: Floats
+    behind: float
 
 
 def covariance(kind: str, matched: Matched, fit: Fit, prior: RotationPrior | None) -> Floats | None:
@@ -38,6 +57,41 @@ def covariance(kind: str, matched: Matched, fit: Fit, prior: RotationPrior | Non
     out = np.diag(np.full(UNKNOWNS, np.inf))
     out[: len(known), : len(known)] = known
     return out
+
+
+def shared(found: Floats, state: State, others: Sequence[Other]) -> Floats:
+    """The second moment (5, 5) about a pose of covariance `found` (5, 5), of it and of other poses."""
+    share = shares(others)
+    total = (1.0 - sum(share)) * found
+    for other, part in zip(others, share, strict=True):
+        apart = np.concatenate([rotation_vector(state[0].T @ other.R), _away(state[1], other.t)])
+        here = np.zeros((UNKNOWNS, UNKNOWNS))
+        here[:3, :3], here[3:, 3:] = state[0].T @ other.R, _carried(state[1], other.t)
+        total += part * (here @ other.covariance @ here.T + np.outer(apart, apart))
+    return total
+
+
+def _carried(t: Floats, other: Floats) -> Floats:
+    """(2, 2) from the tangent plane of one direction to that of t, along the great circle between them."""
+    axis, cosine = np.cross(other, t), float(other @ t)
+    if cosine < -1.0 + 1e-9:
+        return np.eye(2)
+    across = np.cross(np.eye(3), axis).T  # [axis]x
+    turn = np.eye(3) + across + across @ across / (1.0 + cosine)
+    return np.asarray(tangent_basis(t).T @ turn @ tangent_basis(other))
+
+
+def shares(others: Sequence[Other]) -> list[float]:
+    """Probability of each, next to the one taken."""
+    weights = [math.exp(min(-other.behind, 50.0)) for other in others]
+    return [weight / (1.0 + sum(weights)) for weight in weights]
+
+
+def _away(t: Floats, other: Floats) -> Floats:
+    """Direction from the unit vector t to another, as long (2,) as the angle between them, on the tangent plane."""
+    across = tangent_basis(t).T @ other
+    length = math.hypot(*across)
+    return np.asarray(across / length * math.atan2(length, float(t @ other)) if length > 0 else across)
 
 
 def inverse(information: Floats) -> Floats | None:

@@ -145,9 +145,45 @@ def test_a_plane_is_seen_as_one_and_the_gyro_tells_its_two_poses_apart(wrong):
 
 
 def test_the_two_poses_of_a_plane_are_told_where_nothing_tells_them_apart():
-    found = run(view(0, plane=True))
-    assert found.kind == "planar"
-    assert "another pose explains the plane as well" in found.reason
+    pairs = [view(seed, plane=True) for seed in range(20)]
+    # the other plane is what the cameras see where the true one is turned by more
+    pairs += [view(seed, plane=True, w=(0.3, -0.2, 0.1)) for seed in range(20)]
+    found = [run(pair) for pair in pairs]
+    assert all(one.kind == "planar" for one in found)
+    told = [one.reason == "another pose explains the plane as well; the smaller rotation was taken" for one in found]
+    assert np.mean(told) > 0.9
+    wrong = [angle_deg(one.c0_t_c1, pair.t) > 20.0 for one, pair in zip(found, pairs, strict=True)]
+    assert not any(wrong[:20]) and all(wrong[20:])
+    sigma = [np.degrees(np.sqrt(np.linalg.eigvalsh(one.covariance[3:, 3:])[-1])) for one in found]
+    assert np.median(sigma) > 20.0  # deg: of the two poses, not of the one that was taken
+    ratios = [spread(one, pair) for one, pair in zip(found, pairs, strict=True)]
+    assert np.mean(ratios) < 4.0 and max(ratios) < 20.0  # thousands, were the one taken for sure
+
+
+def spread(found, pair):
+    """`nees` with the direction's error as an angle: on the tangent plane itself half a turn has no length."""
+    across = tangent_basis(found.c0_t_c1).T @ pair.t
+    length = np.linalg.norm(across)
+    away = across / length * math.atan2(length, float(found.c0_t_c1 @ pair.t))
+    off = np.concatenate([Rotation.from_matrix(found.c0_R_c1.T @ pair.R).as_rotvec(), away])
+    return off @ np.linalg.solve(found.covariance, off) / 5.0
+
+
+@pytest.mark.parametrize(("baseline", "matches"), [(0.15, 30), (0.08, 30), (0.05, 100)])
+def test_few_matches_of_a_short_baseline_claim_little(baseline, matches):
+    """Some fits look quite elsewhere, or the other way round: taken for sure they would be off by a hundred sigma."""
+    pairs = [view(seed, matches, t=(baseline, 0.0, 0.0)) for seed in range(40)]
+    found = [(run(pair), pair) for pair in pairs]
+    ratios = [spread(one, pair) for one, pair in found if one.kind == "general"]
+    assert len(ratios) > 30 and np.median(ratios) < 1.2 and np.mean(ratios) < 12.0
+    assert np.mean(np.array(ratios) > 10.0) < 0.08
+
+
+def test_a_baseline_that_may_point_either_way_is_told():
+    told = [run(view(seed, 30, t=(0.05, 0.0, 0.0))) for seed in range(20)]
+    doubted = [one for one in told if one.kind == "general" and one.reason]
+    assert len(doubted) >= 4 and {one.reason for one in doubted} == {"another pose explains the matches about as well"}
+    assert min(np.linalg.eigvalsh(one.covariance[3:, 3:])[-1] for one in doubted) > 0.05  # rad^2
 
 
 def test_what_lies_off_a_plane_tells_its_two_poses_apart():
