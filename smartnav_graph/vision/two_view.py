@@ -221,7 +221,7 @@ def _others(
             R, t = faced(matched.only(fit.square < GATE_SQUARE[1]), *fit.state, known_rotation=prior is not None)
             there = minimise(model, (R, t), reach=REACH, prior=prior, iterations=1)
             spread = covariance("general", matched, there, prior)
-            found += [] if spread is None else [Other(*there.state, spread, there.cost - cost)]
+            found += [] if spread is None else [Other(there.state[0], there.state[1], spread, there.cost - cost)]
     return found
 
 
