@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smartnav_graph.report.facts import sensor_name
+from smartnav_graph.report.facts import sensor_name, things
 from smartnav_graph.report.svg import Axis, Plot, axis, exact_axis, finite, legend, spread_axis, time_axis
 from smartnav_graph.report.text import count, fixed, metres, number
 from smartnav_graph.report.thin import thin_dots
@@ -99,14 +100,29 @@ def motion(solution: Solution, gaps: Intervals) -> str:
 def attitude(solution: Solution, gaps: Intervals) -> str:
     """Heading, pitch and roll."""
     t, hpr = solution.seconds, solution.heading_pitch_roll_deg
-    compass = Axis(0.0, 360.0, (0.0, 90.0, 180.0, 270.0, 360.0), ("0", "90", "180", "270", "360"))
-    heading = _over_time(solution, compass, "Heading, clockwise from north [°]", gaps)
-    heading.line(*_unwrapped(t, hpr[:, 0]), "s0")
+    along = np.degrees(np.unwrap(np.radians(hpr[:, 0])))
+    narrow = float(np.ptp(along)) < NARROW_DEG
+    heading = _over_time(solution, _compass(along) if narrow else COMPASS, "Heading, clockwise from north [°]", gaps)
+    if narrow:
+        heading.line(t, along, "s0")
+    else:
+        heading.line(*_unwrapped(t, hpr[:, 0]), "s0")
     tilt = _over_time(solution, axis(hpr[:, 1:], least=2.0), "Pitch and roll [°]", gaps)
     tilt.line(*_unwrapped(t, hpr[:, 1]), "s1")
     tilt.line(*_unwrapped(t, hpr[:, 2]), "s2")
     entries = [("line s0", "Heading"), ("line s1", "Pitch, nose up"), ("line s2", "Roll, right side down")]
     return figure([heading, tilt], entries + _shaded(gaps))
+
+
+COMPASS = Axis(0.0, 360.0, (0.0, 90.0, 180.0, 270.0, 360.0), ("0", "90", "180", "270", "360"))
+NARROW_DEG = 150.0  # headings that turn less are drawn without a break at north
+
+
+def _compass(along: Floats) -> Axis:
+    """An axis of headings that may run through north."""
+    plain = axis(along, least=4.0)
+    whole = 0 if plain.ticks[1] - plain.ticks[0] >= 1 else 1
+    return replace(plain, labels=tuple(fixed(tick % 360.0, whole) for tick in plain.ticks))
 
 
 def _unwrapped(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
@@ -200,7 +216,8 @@ def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
     plot.spans(gaps)
     for level in (-3.0, 3.0):
         plot.rule(level, "limit")
-    for used, cls in ((False, "out"), (True, "res")):
+    few = " few" if int(r.of(sensor).sum()) < 400 else ""
+    for used, cls in ((False, "out"), (True, f"res{few}")):
         rows = r.of(sensor) & (r.used == used) & np.isfinite(r.whitened)
         y = np.clip(r.whitened[rows], -MOST_FAR * 0.97, MOST_FAR * 0.97)
         shown = thin_dots(np.abs(y) > 3.0, 1500)
@@ -217,12 +234,12 @@ def distribution(errors: ArrayLike, what: str) -> str:
     e = np.sort(finite(errors))
     if len(e) < 2:
         return ""
-    share = 100 * np.arange(1, len(e) + 1) / len(e)
+    share = 100 * np.arange(len(e)) / (len(e) - 1)  # as the percentiles count
     x = exact_axis(0.0, max(float(np.percentile(e, 99)) * 1.1, 1e-4), count=6)
     y = Axis(0.0, 100.0, (0.0, 25.0, 50.0, 75.0, 100.0), ("0", "25", "50", "75", "100"))
     plot = Plot(x, y, f"Cumulative distribution of {what}", "Share of epochs [%]", height_px=240)
     plot.x_title = "Horizontal error [m]"
-    plot.line(np.concatenate([[0.0], e]), np.concatenate([[0.0], share]), "s0")
+    plot.line(e, share, "s0")
     for p in (50, 67, 95):
         at = float(np.percentile(e, p))
         plot.line([at, at], [0, p], "limit", thin=False)
@@ -242,7 +259,7 @@ def distribution(errors: ArrayLike, what: str) -> str:
 def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> str:
     """Horizontal errors at withheld measurements: their distribution, and over time beside the estimated sigma."""
     horizontal = np.linalg.norm(np.asarray(scored.error, dtype=np.float64)[:, :2], axis=1)
-    picture = distribution(horizontal, f"withheld {sensor_name(name)} measurements")
+    picture = distribution(horizontal, f"withheld {things(name, 2).split(maxsplit=1)[-1]}")
     if len(solution) < 2 or not len(finite(horizontal)):
         return picture
     sigma = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.report.svg import Axis, Plot, legend, round_step, ticked
-from smartnav_graph.report.text import count, fixed, number
+from smartnav_graph.report.text import count, fixed
 from smartnav_graph.report.thin import thin_path
 from smartnav_graph.session import Session
 from smartnav_graph.solution import POS, Residuals, Solution
@@ -83,7 +83,7 @@ def draw(
     _way(plot, path, "line way")
     entries += _fixes(plot, fixes, ("rejected",)) + under
     _ends(plot, path)
-    _furniture(plot, path)
+    _furniture(plot)
     widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
     return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
 
@@ -174,30 +174,14 @@ def _ends(plot: Plot, path: Floats) -> None:
         )
 
 
-def _furniture(plot: Plot, path: Floats) -> None:
-    """Scale bar and north arrow, each in the emptiest corner that is left."""
-    fx, fy = plot.x.fraction(path[:, 0]), plot.y.fraction(path[:, 1])
-    corners = [(cx, cy) for cx in (0, 1) for cy in (0, 1)]
-    crowd = {c: int(((np.abs(fx - c[0]) < 0.3) & (np.abs(fy - c[1]) < 0.2)).sum()) for c in corners}
-    first, second, *_ = sorted(corners, key=lambda c: (crowd[c], -c[0], -c[1]))
+def _furniture(plot: Plot) -> None:
+    """Scale bar and north arrow, outside the frame: inside they would cover something on a small screen."""
     width = plot.x.hi - plot.x.lo
     length = round_step(width / 5, 1) / (1 if round_step(width / 5, 1) < width / 3.5 else 2)
-    _scale_bar(plot, second, length, 100 * length / width)
-    x, y = ("100%", -26) if first[0] else ("0%", 26)
-    drop = 20 if first[1] else -46
-    at = "0%" if first[1] else "100%"
+    share, text = 100 * length / width, f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     plot.raw(
-        f'<svg class="north" x="{x}" y="{at}"><path d="M{y} {drop}l7 24l-7 -6l-7 6z"/>'
-        f'<text class="note mid" x="{y}" y="{drop + 38}">N</text></svg>'
+        f'<svg class="scale" x="0" y="100%"><rect x="0" y="31" width="{share:.2f}%" height="4"/>'
+        f'<text class="note" x="{share:.2f}%" dx="8" y="37">{text}</text></svg>'
     )
-
-
-def _scale_bar(plot: Plot, corner: tuple[int, int], length: float, share: float) -> None:
-    x = 97 - share if corner[0] else 3
-    y = "0%" if corner[1] else "100%"
-    drop = 30 if corner[1] else -14
-    text = f"{number(length / 1000)} km" if length >= 1000 else f"{number(length)} m"
-    plot.raw(
-        f'<svg class="scale" x="0" y="{y}"><rect x="{x:.2f}%" y="{drop}" width="{share:.2f}%" height="4"/>'
-        f'<text class="note mid" x="{x + share / 2:.2f}%" y="{drop - 6}">{text}</text></svg>'
-    )
+    plot.raw('<svg class="north" x="100%" y="0"><path d="M-7 -27l6 20l-6 -5l-6 5z"/>'
+             '<text class="note end" x="-20" y="-11">N</text></svg>')  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_case import HOLES, REJECTED, drive, summary
+from drive_case import HOLES, REJECTED, Scored, drive, summary
 from lxml import html
 from scipy.spatial.transform import Rotation
 
@@ -88,6 +88,35 @@ def test_withheld_errors_are_shown_one_by_one(dom, case) -> None:
     assert f"95 %: {np.percentile(horizontal, 95):.3f} m" in words(section(dom, "withheld"))
     (dots,) = section(dom, "withheld").xpath('.//svg[@class="box"]/path[contains(@class, "held")]/@d')
     assert dots.count("M") == len(horizontal)
+
+
+def test_a_heading_through_north_is_one_line(tmp_path, case) -> None:
+    """A drive that wavers about north: one line on an axis around 0, its labels headings."""
+    turn = np.radians(90 - 6 * np.sin(case.solution.seconds / 30))
+    wavering = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    dom = written(tmp_path, case, solution=replace(case.solution, nav_R_body=wavering))
+    heading = section(dom, "attitude").xpath('.//svg[contains(@class, "plot")]')[0]
+    labels = heading.xpath('./*[local-name()="text"][@class="tick ty"]/text()')
+    assert "0" in labels and "355" in labels
+    (line,) = heading.xpath('.//path[contains(@class, "line")]/@d')
+    assert line.count("M") == 1
+
+
+def test_percentiles_lie_on_the_curve(tmp_path, case) -> None:
+    few = {
+        "control": Scored(case.solution.t_ns[:5], np.array([[3.0, 0, 0], [1, 0, 0], [0, 2, 0], [4, 0, 0], [0, 5, 0]]))
+    }
+    score = {"control": {"count": 5, "rms_horizontal_m": 3.317}}
+    dom = written(tmp_path, case, summary=summary() | {"withheld": score}, withheld=few)
+    text = words(section(dom, "withheld"))
+    assert "50 %: 3.00 m" in text and "5 withheld control points." in text
+    (plot,) = section(dom, "withheld").xpath('.//svg[contains(@aria-label, "Cumulative")]')
+    (curve,) = plot.xpath('.//path[contains(@class, "s0")]/@d')
+    (pick, *_) = plot.xpath('.//path[contains(@class, "pick")]/@d')
+    steps = np.array([[float(x) for x in p.split(",")] for p in re.sub(r"(?<=\d)-", ",-", curve.split("l")[1]).split()])
+    start = np.array([float(x) for x in re.match(r"M(\d+) (\d+)", curve).groups()])
+    where = np.array([float(x) for x in re.match(r"M(\d+) (\d+)", pick).groups()])
+    assert start + steps[:2].sum(axis=0) == pytest.approx(where, abs=2)  # drawing units
 
 
 def test_map_marks_the_rejected_fixes_where_they_are(dom, case) -> None:
