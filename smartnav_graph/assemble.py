@@ -16,9 +16,10 @@ from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import turned
 from smartnav_graph.graph import Memory, State, Window
 from smartnav_graph.losses import loss_weights
+from smartnav_graph.outcome import Outcome
 from smartnav_graph.prediction import Kinematics, states_at
 from smartnav_graph.problem import TOO_LATE, Problem
-from smartnav_graph.revise import fix_residuals, position_builders
+from smartnav_graph.revise import position_builders
 from smartnav_graph.smoothers.estimate import Estimate, values_of
 from smartnav_graph.smoothers.whole_graph import Stack
 from smartnav_graph.solution import Residuals, Solution
@@ -65,10 +66,11 @@ def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, cov
     )
 
 
-def to_solution(problem: Problem, estimate: Estimate, memory: Memory) -> Solution:
+def to_solution(outcome: Outcome) -> Solution:
     """The keyframes with their residuals."""
-    solution = _solution(problem, estimate.t_ns, Kinematics(*estimate.states()), estimate.covariance)
-    return replace(solution, residuals=residuals(problem, estimate, memory))
+    estimate = outcome.estimate
+    solution = _solution(outcome.problem, estimate.t_ns, Kinematics(*estimate.states()), estimate.covariance)
+    return replace(solution, residuals=residuals(outcome))
 
 
 def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]) -> Any:
@@ -95,12 +97,13 @@ def causal_solution(problem: Problem, states: Sequence[State]) -> Solution:
     return _solution(problem, t_ns, kinematics, np.array([state.covariance for state in states]))
 
 
-def residuals(problem: Problem, estimate: Estimate, memory: Memory) -> Residuals:
+def residuals(outcome: Outcome) -> Residuals:
     """Whitened residuals of every factor, and of rejected rows."""
+    problem, estimate, memory = outcome.problem, outcome.estimate, outcome.memory
     parts: list[Part] = []
     positions = {builder.name: builder for builder in position_builders(problem.builders)}
     for builder in positions.values():
-        found = fix_residuals(builder, problem.windows, estimate, memory)
+        found = outcome.fixes[builder.name]
         used = memory.used(builder.name, found.rows)
         white = found.residual / found.sigma
         weight = np.where(used, _weights(builder, white), 0.0)

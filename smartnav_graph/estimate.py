@@ -27,6 +27,7 @@ from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_state import initialiser_of
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
+from smartnav_graph.outcome import Outcome
 from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.progress import Progress, silent, watched
@@ -246,25 +247,24 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     )
     clock.lap("build")
     _refuse_empty(problem, memory)
-    return _finish(problem, initial, estimate, memory, clock, {"passes": passes})
+    return _finish(Outcome(problem, estimate, memory), initial, clock, {"passes": passes})
 
 
 def _finish(
-    problem: Problem,
+    outcome: Outcome,
     initial: Initial,
-    estimate: Estimate,
-    memory: Memory,
     clock: Clock,
     extra: Mapping[str, Any],
     causal: Solution | None = None,
     updates: Updates | None = None,
 ) -> Run:
-    keyframes = to_solution(problem, estimate, memory)
+    problem, estimate = outcome.problem, outcome.estimate
+    keyframes = to_solution(outcome)
     withheld = score(problem, keyframes, estimate)
     solution = densify(problem, keyframes)
     clock.lap("assemble")
-    summary = summarise(problem, initial, estimate, memory, keyframes, withheld, clock.to_dict(), extra)
-    trace = Trace.of(problem, estimate, memory, updates)
+    summary = summarise(outcome, initial, keyframes, withheld, clock.to_dict(), extra)
+    trace = Trace.of(problem, estimate, outcome.memory, updates)
     return Run(problem, solution, summary, causal, withheld, trace=trace, estimate=estimate)
 
 
@@ -333,7 +333,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         except KeyboardInterrupt:
             extra["mode"] += ", polish interrupted"
         clock.lap("polish")
-    run = _finish(problem, initial, estimate, memory, clock, extra, causal, updates)
+    run = _finish(Outcome(problem, estimate, memory), initial, clock, extra, causal, updates)
     return replace(run, causal_windows=windows)
 
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from smartnav_graph.graph import Memory
+from smartnav_graph.outcome import Outcome
 from smartnav_graph.problem import Problem
-from smartnav_graph.revise import fix_residuals, position_builders
 from smartnav_graph.smoothers.estimate import Estimate
 
 Rejection = Mapping[str, Any]
@@ -19,30 +18,28 @@ LEFT_OUT = 0.1
 MOST = 10_000  # rejections told one by one
 
 
-def rejections(problem: Problem, estimate: Estimate, memory: Memory) -> list[Rejection]:
+def rejections(outcome: Outcome) -> list[Rejection]:
     """Rejected rows in time order: t_s since time zero, sensor, row of its stream, size_sigma (norm of the whitened
     residual) and, for positions, size_m. The largest `MOST` where there are more."""
-    found = _positions(problem, estimate, memory)
+    found = _positions(outcome)
     known = {(one["sensor"], one["row"]) for one in found}
-    found += [one for one in _rows(problem, estimate) if (one["sensor"], one["row"]) not in known]
+    found += [one for one in _rows(outcome.problem, outcome.estimate) if (one["sensor"], one["row"]) not in known]
     found = sorted(found, key=lambda one: -float(one["size_sigma"]))[:MOST]
     return sorted(found, key=lambda one: (one["t_s"], one["sensor"]))
 
 
-def _positions(problem: Problem, estimate: Estimate, memory: Memory) -> list[Rejection]:
+def _positions(outcome: Outcome) -> list[Rejection]:
     """Fixes that the gate rejected."""
     told: list[Rejection] = []
-    for builder in position_builders(problem.builders):
-        residuals = fix_residuals(builder, problem.windows, estimate, memory)
-        stream = getattr(problem.session, builder.name, None)
-        out = np.flatnonzero(~memory.used(builder.name, residuals.rows))
+    problem, estimate = outcome.problem, outcome.estimate
+    for name, residuals in outcome.fixes.items():
+        stream = getattr(problem.session, name, None)
+        out = np.flatnonzero(~outcome.memory.used(name, residuals.rows))
         metres, sigmas = np.linalg.norm(residuals.residual, axis=1), np.sqrt(residuals.square)
         for k in out:
             row = int(residuals.rows[k])
             t_ns = int(estimate.t_ns[residuals.keyframe[k]] if stream is None else stream.t_ns[row])
-            told.append(
-                _entry(problem, t_ns, builder.name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)}
-            )
+            told.append(_entry(problem, t_ns, name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)})
     return told
 
 

@@ -16,10 +16,11 @@ from smartnav_graph.assemble import Withheld, used_counts
 from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
 from smartnav_graph.factors.correlated import wander_sigma
 from smartnav_graph.graph import Memory
+from smartnav_graph.outcome import Outcome
 from smartnav_graph.pair_gate import Account, account
 from smartnav_graph.problem import Problem
 from smartnav_graph.rejections import rejections
-from smartnav_graph.revise import OBSERVED, fix_residuals, position_builders
+from smartnav_graph.revise import OBSERVED, position_builders
 from smartnav_graph.row_noise import noise_groups
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.solution import POS, Solution
@@ -51,18 +52,14 @@ def peak_memory_mb() -> float:
 
 
 def _chi2_per_dof(
-    problem: Problem,
-    estimate: Estimate,
-    memory: Memory,
-    solution: Solution,
-    seen: Account | None,
-    tracks: track_gate.Account | None,
+    outcome: Outcome, solution: Solution, seen: Account | None, tracks: track_gate.Account | None
 ) -> dict[str, float]:
     """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
 
     Unknowns are the states less the equations that chains and priors bring with them. The redundancy of a fix is what
     its posterior leaves of its variance; the inertial factors have the rest.
     """
+    estimate, memory = outcome.estimate, outcome.memory
     rows = {
         sensor: solution.residuals.of(sensor) & solution.residuals.used for sensor in set(solution.residuals.sensor)
     }
@@ -83,10 +80,10 @@ def _chi2_per_dof(
     if tracks is not None and tracks.in_force:
         left -= tracks.redundancy
         result[SMART] = squares.get(SMART, 0.0) / tracks.redundancy
-    for builder in position_builders(problem.builders):
+    for builder in position_builders(outcome.problem.builders):
         if builder.name in memory.correlated:
             continue
-        found = fix_residuals(builder, problem.windows, estimate, memory)
+        found = outcome.fixes[builder.name]
         used = memory.used(builder.name, found.rows)
         redundancy = float(found.redundancy[used].sum())
         left -= redundancy
@@ -116,16 +113,15 @@ def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
 
 
 def summarise(
-    problem: Problem,
+    outcome: Outcome,
     initial: Initial,
-    estimate: Estimate,
-    memory: Memory,
     keyframes: Solution,
     withheld: Mapping[str, Withheld],
     timings: Mapping[str, float],
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The content of summary.json; `extra` overrides and adds."""
+    problem, estimate, memory = outcome.problem, outcome.estimate, outcome.memory
     t0 = problem.session.t0_ns
     duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
     factors: dict[str, int] = {}
@@ -135,7 +131,7 @@ def summarise(
         factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, memory))
     seen, tracks = account(problem.builders, memory), track_gate.account(problem.builders, memory)
-    chi2 = _chi2_per_dof(problem, estimate, memory, keyframes, seen, tracks)
+    chi2 = _chi2_per_dof(outcome, keyframes, seen, tracks)
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     told = [one.refused for one in (seen, tracks) if one is not None and one.refused]
@@ -159,7 +155,7 @@ def summarise(
         "iterations": estimate.iterations,
         "converged": estimate.converged,
         "cost": estimate.cost,
-        "states": _states(problem, estimate, memory),
+        "states": _states(outcome),
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),
@@ -173,7 +169,7 @@ def summarise(
         "rejected": _rejected(memory, seen, tracks),
         **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
         **({} if tracks is None else {"tracks": dict(tracks.tracks)}),
-        "rejections": rejections(problem, estimate, memory),
+        "rejections": rejections(outcome),
         "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
         "position_sigma_m": _sigma_summary(keyframes),
         "initialisation": initial.to_dict(),
@@ -194,8 +190,9 @@ def _rejected(memory: Memory, seen: Account | None, tracks: track_gate.Account |
     return found
 
 
-def _states(problem: Problem, estimate: Estimate, memory: Memory) -> dict[str, dict[str, Any]]:
+def _states(outcome: Outcome) -> dict[str, dict[str, Any]]:
     """The states of the session, and the noise found on the way."""
+    problem, estimate, memory = outcome.problem, outcome.estimate, outcome.memory
     found: dict[str, dict[str, Any]] = {}
     for state in estimate.session.values():
         sigma = state.prior_sigma if state.held else state.sigma

@@ -16,7 +16,7 @@ ORDER = (
     *("solution", "losses", "graph", "factors", "keyframes", "late", "prediction", "smoothers"),
     *("first_seconds", "first_field", "first_attitude", "walk_start", "graduated", "consensus", "start", "initialise"),
     *("config", "withhold", "problem", "variance", "row_noise", "pair_gate", "track_gate", "revise"),
-    *("first_state", "rejections", "assemble", "influence", "summary", "trace", "estimate"),
+    *("first_state", "outcome", "rejections", "assemble", "influence", "summary", "trace", "estimate"),
     *("evaluation", "intervals", "export", "report", "rerun_log"),
     *("run_folder", "differences", "explain", "cli", "__main__"),
 )

@@ -106,11 +106,13 @@ def test_the_first_state_may_look_at_thirty_seconds_only(eight):
 
 def test_progress_is_told(eight):
     seen = []
-    estimate.smooth(eight, progress=lambda stage, done, total: seen.append((stage, done, total)))
-    assert seen[0] == ("solve", 0, 8)
+    estimate.smooth(eight, progress=lambda *row: seen.append(row))
+    assert seen[:2] == [("preparing", 0, 0), ("finding the start", 0, 0)]
+    assert seen[2:4] == [("pass 1 of at most 8", 0, 62), ("pass 1 of at most 8", 1, 62)]
+    assert seen[-1][0].endswith("solving")
     seen.clear()
-    estimate.replay(eight, progress=lambda stage, done, total: seen.append((stage, done, total)))
-    assert seen[:2] == [("replay", 0, 62), ("replay", 1, 62)] and seen[-1][0] == "solve"
+    estimate.replay(eight, progress=lambda *row: seen.append(row))
+    assert seen[2:4] == [("replay", 0, 62), ("replay", 1, 62)] and seen[-1][0].endswith("solving")
 
 
 def test_stages_add_up(run):
