@@ -50,7 +50,7 @@ def page(
     shaded = [(start, start + length) for start, length, _ in holes]
     compared = facts.evaluation_facts(evaluation)
     parts = [
-        warnings(summary),
+        warnings(solution, summary),
         section("map", "Trajectory", track.draw(session, solution, holes, causal)),
         section("timeline", "What happened when", timeline.draw(solution, summary, shaded, scored)),
         section("statistics", "The run in figures", statistics.table(session, solution, summary).html()),
@@ -116,9 +116,9 @@ def sigma_sentence(solution: Solution) -> str:
     )
 
 
-def warnings(summary: Summary) -> str:
+def warnings(solution: Solution, summary: Summary) -> str:
     """What to be careful about, and what to do."""
-    told = facts.warnings(summary)
+    told = usage.lost_warnings(solution) + facts.warnings(summary)
     if not told:
         text = "No warnings." if "warnings" in summary else "The run did not record warnings."
         return section("warnings", "Warnings", f'<p class="calm">{text}</p>', {"count": 0})

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smartnav_graph.report.facts import Summary, chi2_by_sensor, room, sensor_name, things, withheld_counts
 from smartnav_graph.report.text import DASH, Row, Table, as_float, capital, count, fixed, metres, number, seconds
 from smartnav_graph.solution import Solution
 
 SMALL = 0.3  # chi2 per degree of freedom of noise that is stated too large
+LOST_ROWS = 10  # fixes in a row that are no outliers any more
 POSITIONS = ("gnss", "control", "pose_fixes")
 # What no sensor measured, and what it means.
 ASSUMED = {
@@ -151,6 +153,35 @@ def silence_sentence(silence: Silence) -> str:
         f"The longest stretch without a {what} in use is {seconds(silence.length_s)}, from t = "
         f"{seconds(silence.start_s)} on."
     )
+
+
+def lost_warnings(solution: Solution) -> list[tuple[str, str]]:
+    """Sensors of positions of which more fixes in a row were rejected than outliers come: what, remedy."""
+    told = []
+    for name in POSITIONS if len(solution.residuals) else ():
+        row = _longest_row(solution, name)
+        if len(row) >= LOST_ROWS:
+            first, last = (row[[0, -1]] - solution.t0_ns) / 1e9
+            told.append(
+                (
+                    f"{sensor_name(name)}: {things(name, len(row))} in a row rejected, from {seconds(first)} to "
+                    f"{seconds(last)}; outliers do not come like this",
+                    "The estimate has lost its way there, or the sensor has for long: compare path and fixes on the "
+                    "map, and smooth this stretch by itself (--from, --to)",
+                )
+            )
+    return told
+
+
+def _longest_row(solution: Solution, sensor: str) -> NDArray[np.int64]:
+    """Stamps of the longest row of fixes of which nothing was used."""
+    r = solution.residuals
+    rows = r.of(sensor)
+    t, place = np.unique(r.t_ns[rows], return_inverse=True)
+    kept = np.bincount(place, weights=r.used[rows], minlength=len(t)) > 0
+    pieces = np.split(np.arange(len(t)), np.flatnonzero(np.diff(kept.astype(int))) + 1)
+    lost = [piece for piece in pieces if len(piece) and not kept[piece[0]]]
+    return np.asarray(t[max(lost, key=len)] if lost else t[:0], dtype=np.int64)
 
 
 def careful_sentence(summary: Summary) -> str:

@@ -254,6 +254,16 @@ def test_too_many_rejections_are_a_warning(tmp_path, case) -> None:
     assert "too many" not in words(section(written(tmp_path, case), "warnings"))
 
 
+def test_many_rejections_in_a_row_are_a_warning(tmp_path, case) -> None:
+    r = case.solution.residuals
+    end = r.of("gnss") & (r.t_ns >= case.solution.t0_ns + 440 * 10**9)
+    dom = written(tmp_path, case, solution=replace(case.solution, residuals=replace(r, used=r.used & ~end)))
+    assert "GNSS: 15 GNSS fixes in a row rejected, from 440.0 s to 468.0 s; outliers do not come like this" in words(
+        section(dom, "warnings")
+    )
+    assert "in a row" not in words(section(written(tmp_path, case), "warnings"))
+
+
 def test_errors_far_beyond_the_sigmas_are_told_in_words(tmp_path, case) -> None:
     table = case.evaluation.to_dict()
     assert "After alignment it says little" in facts.nees_sentence(table)
