@@ -149,7 +149,10 @@ def readable(low: float, high: float) -> tuple[float, float]:
     if np.floor(high / step) - np.ceil(low / step) >= 1:
         return low, high
     up, down = np.ceil(high / step) * step, np.floor(low / step) * step
-    return (low, float(up)) if up - high <= low - down else (float(down), high)
+    above = up - high <= low - down
+    low, high = (low, float(up)) if above else (float(down), high)
+    edge = 0.06 * (high - low)  # a number on the very edge is cut off
+    return (low, high + edge) if above else (low - edge, high)
 
 
 @contextmanager

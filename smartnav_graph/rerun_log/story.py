@@ -33,6 +33,13 @@ _LEGEND = {
     "/world/control": "**pink points**, surveyed points",
 }
 
+_IMAGE_LEGEND = {
+    "/matches": "**lines** from where a point was in the first image of a pair to where it is in the second, the last "
+    "one matched: **green**, in use; **red**, refused, alone or with its pair; **amber**, of a pair without a baseline to "
+    "speak of or with too few matches; **light blue**, not judged",
+    "/tracks": "**points**, tracked features, one colour a track",
+}
+
 Line = tuple[int, str, str]
 
 
@@ -127,13 +134,20 @@ def _capped(lines: list[Line]) -> list[Line]:
     return [*lines[:MOST_LINES_A_KIND], (t, level, f"{text}; {len(lines) - MOST_LINES_A_KIND - 1} more like this")]
 
 
+def _of_images(path: str) -> str:
+    """What something drawn in an image means; empty for anything else."""
+    return next((text for end, text in _IMAGE_LEGEND.items() if path.endswith(end) and path != "/pairs/matches"), "")
+
+
 def log_report(recorder: Recorder, markdown: str | None) -> None:
     """The report's text at /report, and at /legend what the colours of the scene mean."""
     import rerun as rr
 
     if markdown:
         recorder.static("/report", rr.TextDocument(markdown, media_type="text/markdown"))
-    lines = [f"* [{path}](recording:/{path}): {text}" for path, text in _LEGEND.items() if recorder.has(path)]
+    meaning = {path: text for path, text in _LEGEND.items() if recorder.has(path)}
+    meaning |= {path: text for path in sorted(recorder.paths) if (text := _of_images(path))}
+    lines = [f"* [{path}](recording:/{path}): {text}" for path, text in meaning.items()]
     if lines:
         document = "# What is drawn\n\n" + "\n".join(lines) + "\n"
         recorder.static("/legend", rr.TextDocument(document, media_type="text/markdown"))

@@ -125,3 +125,9 @@ def test_matches_of_a_session_are_shown_before_it_is_solved(tmp_path):
     np.testing.assert_allclose(np.concatenate(start), PAIRS.x0[:3], rtol=1e-6)
     assert "Points of cam0 (normalised)" in bare.view_names()
     assert session.t0_ns == T0
+
+
+def test_legend_says_what_the_colours_of_matches_mean(found):
+    legend = found.rows("/legend", "TextDocument:text", static=True)[0][0]
+    assert f"* [{PATH}](recording:/{PATH}): **lines** from where a point was" in legend
+    assert "/pairs/matches" not in legend
