@@ -35,8 +35,8 @@ _LEGEND = {
 
 _IMAGE_LEGEND = {
     "/matches": "**lines** from where a point was in the first image of a pair to where it is in the second, the last "
-    "one matched: **green**, in use; **red**, refused, alone or with its pair; **amber**, of a pair without a baseline to "
-    "speak of or with too few matches; **light blue**, not judged",
+    "one matched: **green**, in use; **red**, refused, alone or with its pair; **amber**, of a pair without a "
+    "baseline to speak of or with too few matches; **light blue**, not judged",
     "/tracks": "**points**, tracked features, one colour a track",
 }
 
