@@ -88,6 +88,7 @@ def _views(builder: SmartBuilder, estimate: Estimate) -> _Views:
     seen, stamps = builder.sightings, builder.image_ns
     place = np.clip(np.searchsorted(estimate.t_ns, stamps - builder.merge_ns), 0, len(estimate.t_ns) - 1)
     known = np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+    known[1:] &= place[1:] != place[:-1]  # a keyframe stands for one image
     R, p, v, bias = (x[place][seen.image.ravel()] for x in estimate.states())
     delay = estimate.offset_s(STREAM) + builder.eye.delay(seen.xy.reshape(-1, 2))
     turn = builder.rates.turn(stamps[seen.image.ravel()], delay) - bias[:, 3:] * delay[:, None]

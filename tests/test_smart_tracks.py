@@ -110,6 +110,20 @@ def test_a_replay_has_pairs_and_its_polish_tracks(room, run):
     np.testing.assert_allclose(replayed.causal.nav_t_body, pairs.causal.nav_t_body, atol=1e-9)
 
 
+def test_images_that_share_a_keyframe_count_once(room):
+    """Tracks of a second image 50 us after each: one pose has one observation of a track."""
+    tracks = room.tracks
+    both = np.argsort(np.concatenate([tracks.t_ns, tracks.t_ns + 50_000]), kind="stable")
+    twice = {name: np.concatenate([column, column])[both] for name, column in tracks.columns().items()}
+    twice["t_ns"] = np.concatenate([tracks.t_ns, tracks.t_ns + 50_000])[both]
+    doubled = room.replace(tracks=type(tracks).from_columns(twice))
+    found = smooth(doubled, options(coplanarity={"rate_hz": 1e6, "spans": [2, 8]}, run={"end_s": 9.0}))
+    assert found.summary["factors"]["smart"] > 50
+    builder = next(b for b in found.problem.builders if b.name == "smart")
+    used = builder.use & (builder.verdict == IN_USE)[:, None]
+    assert (builder.sightings.image[used] % 2 == 0).all()
+
+
 def test_marginals_are_those_of_the_whole_system(room):
     """The recursion over the Bayes net, whose keyframes are tied over many, beside a dense inverse."""
     problem = prepare(room, options(run={"end_s": 9.0}))

@@ -63,17 +63,26 @@ class Sightings:
 
 def of_tracks(tracks: Tracks, stamps: NDArray[np.int64], most: int) -> Sightings:
     """Tracks in the images of these stamps (k,), those with more than `most` observations in parts of even length;
-    what was seen in one image alone says nothing, and is left out. Ordered by their last image."""
+    what was seen in one image alone says nothing, and is left out, as is what has two places in one image. Ordered by
+    their last image."""
     chosen = np.flatnonzero(np.isin(tracks.t_ns, stamps))
     image = np.searchsorted(stamps, tracks.t_ns[chosen])
     order = np.lexsort((image, tracks.track_id[chosen]))
     image, name, xy = image[order], tracks.track_id[chosen][order], tracks.xy_n[chosen][order]
+    clear = _alone(image, name)
+    image, name, xy = image[clear], name[clear], xy[clear]
     names, first, length = np.unique(name, return_index=True, return_counts=True)
     parts = -(-length // most)
     within = np.arange(len(name)) - np.repeat(first, length)
     part = within * np.repeat(parts, length) // np.repeat(length, length)
     group = np.repeat(np.concatenate([[0], np.cumsum(parts)])[:-1], length) + part
     return _padded(np.repeat(names, parts), group, image, xy)
+
+
+def _alone(image: Ints, name: NDArray[np.int64]) -> Mask:
+    """Rows (m,), sorted by name and image, that no neighbour repeats."""
+    same = (image[1:] == image[:-1]) & (name[1:] == name[:-1])
+    return np.asarray(~(np.concatenate([[False], same]) | np.concatenate([same, [False]])), dtype=bool)
 
 
 def _padded(names: NDArray[np.int64], group: Ints, image: Ints, xy: Floats) -> Sightings:

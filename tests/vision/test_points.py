@@ -30,6 +30,12 @@ def test_tracks_in_some_images_in_parts_of_even_length():
     np.testing.assert_allclose(found.xy[found.there][:4], [[0, 0], [0.1, 0], [0.2, 0], [0.3, 0]])
 
 
+def test_a_track_with_two_places_in_an_image_has_none_there():
+    rows = [(t, 1, t / 10, 0.0) for t in range(4)] + [(2, 1, 0.9, 0.9), (2, 3, 0.1, 0.1), (3, 3, 0.1, 0.1)]
+    found = of_tracks(tracks(sorted(rows)), np.arange(4), 20)
+    assert found.track.tolist() == [1, 3] and found.image[0].tolist() == [0, 1, 3]
+
+
 def test_no_track_at_all():
     assert len(of_tracks(tracks([(1, 2, 0.0, 0.0), (3, 4, 0.0, 0.0)]), np.array([1, 3]), 20)) == 0
 
