@@ -3,11 +3,13 @@
 The loop is ours because GTSAM's own copies all values into Python for every custom factor, and because an elimination
 order of our own makes the marginals cheap. Damping comes only when a Gauss-Newton step does not lower the cost.
 
-Source: Nocedal, Wright (2006), Numerical Optimization, 10.3.
+Source: Nocedal, Wright (2006), Numerical Optimization, 10.3; Grippo, Lampariello, Lucidi (1986), SIAM J. Numer. Anal.
+23(4), 707 (steps that lower the largest of the last costs).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +38,10 @@ class SolveConfig:
 
 # Iterations in a row that no longer lower the cost end the search even where a state that nothing holds still moves.
 FLAT = 3
+
+# A Gauss-Newton step may cost more than the last one, not more than all of so many: along a curved valley the next
+# ones are lower than damped steps would come to.
+RECENT = 4
 
 # Enough to go on from: a later solve finishes the work.
 COARSE = SolveConfig(max_iterations=40, tolerance=0.03, step_tolerance=1.0)
@@ -77,13 +83,14 @@ def minimise(
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
     trust = np.concatenate([kind_of(name).trust for name in list(values.keys())])
     damping, iterations, converged, flat = 0.0, 0, False, 0
+    recent = deque([cost], RECENT)
     while iterations < config.max_iterations and not converged:
         iterations += 1
         linear = graph.linearize(values)
         while True:
             delta = _step(linear, order, damping)
             candidate, new_cost = _better(graph, values.retract(delta), cost, shoot)
-            if new_cost <= cost * (1 + 1e-9) + 1e-12:
+            if new_cost <= (cost if damping else max(recent)) * (1 + 1e-9) + 1e-12:
                 break
             damping = max(10.0 * damping, 1e-2)
             if damping > 1e10:
@@ -92,6 +99,7 @@ def minimise(
         flat = flat + 1 if cost - new_cost <= config.tolerance * max(new_cost, 1.0) else 0
         converged = new_cost <= enough or (damping <= 1.0 and flat > 0 and (small or flat >= FLAT))
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
+        recent.append(cost)
     return Solve(values, cost, iterations, converged)
 
 
