@@ -229,7 +229,8 @@ def _write_views(
             write_latency(folder / "latency.rrd", session=run.session, trace=run.trace, identity=identity)
     if report:
         progress("writing the report", 0, 0)
-        write_report(folder / "report.html", withheld=run.withheld, **common)
+        updates = None if run.trace is None else run.trace.updates
+        write_report(folder / "report.html", withheld=run.withheld, updates=updates, **common)
 
 
 def plain(value: Any) -> Any:

@@ -21,6 +21,7 @@ from smartnav_graph.report.charts import Scored
 from smartnav_graph.report.sections import page
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
+from smartnav_graph.trace import Updates
 
 __all__ = ["report_markdown", "write_report"]
 
@@ -34,6 +35,7 @@ def write_report(
     evaluation: Any = None,
     causal: Solution | None = None,
     withheld: Mapping[str, Scored] | None = None,
+    updates: Updates | None = None,
 ) -> None:
     """Write the report of one run as a single HTML file; what stood at `path` is replaced.
 
@@ -47,13 +49,14 @@ def write_report(
         ``rotation_error_deg`` (n,), ``sigma_enu`` (n, 3)
     causal : the states as each became known while replaying
     withheld : by sensor, errors at withheld measurements: ``t_ns`` (n,) int64 and ``error`` (n, 3) m east, north, up
+    updates : of a replay
 
     Raises
     ------
     SessionError
         The file cannot be written.
     """
-    text = page(session, solution, summary, evaluation, causal, withheld or {})
+    text = page(session, solution, summary, evaluation, causal, withheld or {}, updates)
     with replacing(path) as new:
         new.write_text(text, encoding="utf-8")
 

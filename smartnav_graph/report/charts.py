@@ -53,13 +53,15 @@ def time_of(solution: Solution) -> Axis:
     return time_axis(float(t[0]), float(t[-1]))
 
 
-def _over_time(solution: Solution, y: Axis, title: str, gaps: Intervals, height: int = 190) -> Plot:
+def over_time(solution: Solution, y: Axis, title: str, gaps: Intervals, height: int = 190) -> Plot:
+    """An empty plot over the time of a run, its IMU holes shaded."""
     plot = Plot(time_of(solution), y, f"{title} over time", title, height_px=height)
     plot.spans(gaps)
     return plot
 
 
-def _shaded(gaps: Intervals) -> list[tuple[str, str]]:
+def shaded(gaps: Intervals) -> list[tuple[str, str]]:
+    """The legend of the IMU holes, where there are any."""
     return [("gap", "IMU hole")] if gaps else []
 
 
@@ -67,23 +69,23 @@ def uncertainty(solution: Solution, gaps: Intervals, causal: Solution | None) ->
     """One-sigma position and heading."""
     t, sigma = solution.seconds, solution.sigmas[:, POS]
     extra = [] if causal is None else [finite(causal.sigmas[:, POS][:, :2])]
-    position = _over_time(solution, spread_axis(np.concatenate([finite(sigma), *extra])), "Position, 1 sigma [m]", gaps)
+    position = over_time(solution, spread_axis(np.concatenate([finite(sigma), *extra])), "Position, 1 sigma [m]", gaps)
     if causal is not None:
         horizontal = np.linalg.norm(causal.sigmas[:, POS][:, :2], axis=1)
         position.line(causal.seconds, horizontal, "causal")
     for i in range(3):
         position.line(t, sigma[:, i], f"s{i}")
-    heading = _over_time(solution, spread_axis(solution.sigma_heading_deg), "Heading, 1 sigma [°]", gaps, 150)
+    heading = over_time(solution, spread_axis(solution.sigma_heading_deg), "Heading, 1 sigma [°]", gaps, 150)
     heading.line(t, solution.sigma_heading_deg, "s3")
     entries = [(f"line s{i}", name) for i, name in enumerate(AXES)] + [("line s3", "Heading")]
     entries += [("line causal", "Horizontal while replaying")] if causal is not None else []
-    return figure([position, heading], entries + _shaded(gaps))
+    return figure([position, heading], entries + shaded(gaps))
 
 
 def motion(solution: Solution, gaps: Intervals) -> str:
     """Speed and height."""
     t, speed = solution.seconds, np.linalg.norm(solution.nav_v_body, axis=1)
-    fast = _over_time(solution, axis(speed, include=(0.0,), least=0.1), "Speed [m/s]", gaps)
+    fast = over_time(solution, axis(speed, include=(0.0,), least=0.1), "Speed [m/s]", gaps)
     fast.line(t, speed, "s0")
     known = solution.origin is not None
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
@@ -91,10 +93,10 @@ def motion(solution: Solution, gaps: Intervals) -> str:
     sigma = solution.sigmas[:, POS][:, 2]
     band = _core(np.concatenate([height - sigma, height + sigma]))
     whole = np.ptp(band) < 10 * max(float(np.ptp(height)), 1.0) if len(band) else False
-    high = _over_time(solution, axis(np.concatenate([height, band]) if whole else height, least=0.5), title, gaps)
+    high = over_time(solution, axis(np.concatenate([height, band]) if whole else height, least=0.5), title, gaps)
     high.band(t, height - sigma, height + sigma, "s0")
     high.line(t, height, "s0")
-    return figure([fast, high], [("line s0", "Estimate"), ("band s0", "± 1 sigma"), *_shaded(gaps)])
+    return figure([fast, high], [("line s0", "Estimate"), ("band s0", "± 1 sigma"), *shaded(gaps)])
 
 
 def attitude(solution: Solution, gaps: Intervals) -> str:
@@ -102,16 +104,16 @@ def attitude(solution: Solution, gaps: Intervals) -> str:
     t, hpr = solution.seconds, solution.heading_pitch_roll_deg
     along = np.degrees(np.unwrap(np.radians(hpr[:, 0])))
     narrow = float(np.ptp(along)) < NARROW_DEG
-    heading = _over_time(solution, _compass(along) if narrow else COMPASS, "Heading, clockwise from north [°]", gaps)
+    heading = over_time(solution, _compass(along) if narrow else COMPASS, "Heading, clockwise from north [°]", gaps)
     if narrow:
         heading.line(t, along, "s0")
     else:
         heading.line(*_unwrapped(t, hpr[:, 0]), "s0")
-    tilt = _over_time(solution, axis(hpr[:, 1:], least=2.0), "Pitch and roll [°]", gaps)
+    tilt = over_time(solution, axis(hpr[:, 1:], least=2.0), "Pitch and roll [°]", gaps)
     tilt.line(*_unwrapped(t, hpr[:, 1]), "s1")
     tilt.line(*_unwrapped(t, hpr[:, 2]), "s2")
     entries = [("line s0", "Heading"), ("line s1", "Pitch, nose up"), ("line s2", "Roll, right side down")]
-    return figure([heading, tilt], entries + _shaded(gaps))
+    return figure([heading, tilt], entries + shaded(gaps))
 
 
 COMPASS = Axis(0.0, 360.0, (0.0, 90.0, 180.0, 270.0, 360.0), ("0", "90", "180", "270", "360"))
@@ -150,7 +152,7 @@ def biases(solution: Solution, gaps: Intervals) -> str:
             plot.band(t, bias[:, i] - spread[:, i], bias[:, i] + spread[:, i], "s0")
             plot.line(t, bias[:, i], "s0")
             figures.append(figure([plot]))
-    marks = [("line s0", "Bias"), ("band s0", "± 1 sigma"), ("band s0 wide", "± 3 sigma"), *_shaded(gaps)]
+    marks = [("line s0", "Bias"), ("band s0", "± 1 sigma"), ("band s0 wide", "± 3 sigma"), *shaded(gaps)]
     note = '<p class="fine">In body axes. Where the first seconds are wider than the frame they are cut.</p>'
     return legend(marks) + grid(figures) + note
 
@@ -205,7 +207,7 @@ def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
         far += [f"{sensor_name(sensor)} {count(n)}"] if n else []
     note = f"Beyond ± {fixed(MOST_FAR, 0)} sigma, drawn at the edge: {', '.join(far)}." if far else ""
     entries = [("dots res", "Used"), *([("dots out", "Rejected")] if rejected else []), ("line limit", "± 3 sigma")]
-    return figure(plots, [*entries, *_shaded(gaps)], note)
+    return figure(plots, [*entries, *shaded(gaps)], note)
 
 
 def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
@@ -264,10 +266,10 @@ def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> 
         return picture
     sigma = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)
     y = axis(np.concatenate([horizontal, finite(sigma)]), include=(0.0,))
-    plot = _over_time(solution, y, "Horizontal error [m]", gaps)
+    plot = over_time(solution, y, "Horizontal error [m]", gaps)
     plot.line(solution.seconds, sigma, "s3")
     plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "held")
-    marks = [("dots held", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *_shaded(gaps)]
+    marks = [("dots held", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *shaded(gaps)]
     return picture + figure([plot], marks)
 
 
@@ -282,7 +284,7 @@ def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> st
     limit = axis(error, include=(0.0,), count=4)
     plots = []
     for i, name in enumerate(AXES):
-        plot = _over_time(solution, limit, f"{name} error [m]", gaps, 130)
+        plot = over_time(solution, limit, f"{name} error [m]", gaps, 130)
         if sigma is not None:
             spread = np.asarray(sigma, dtype=np.float64)[:, i]
             plot.band(t, -spread, spread, f"s{i}")
@@ -290,8 +292,8 @@ def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> st
         plots.append(plot)
     rotation = getattr(evaluation, "rotation_error_deg", None)
     if rotation is not None and len(finite(rotation)):
-        turn = _over_time(solution, axis(rotation, include=(0.0,), count=4), "Rotation error [°]", gaps, 130)
+        turn = over_time(solution, axis(rotation, include=(0.0,), count=4), "Rotation error [°]", gaps, 130)
         turn.line(t, np.asarray(rotation, dtype=np.float64), "s3")
         plots.append(turn)
     band = [("band s0", "± 1 sigma, as estimated")] if sigma is not None else []
-    return figure(plots, [*((f"line s{i} solid", f"{n} error") for i, n in enumerate(AXES)), *band, *_shaded(gaps)])
+    return figure(plots, [*((f"line s{i} solid", f"{n} error") for i, n in enumerate(AXES)), *band, *shaded(gaps)])

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.report import charts, constants, facts, statistics, timeline, track, usage
+from smartnav_graph.report import charts, constants, facts, replays, statistics, timeline, track, usage
 from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres, plural
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
+from smartnav_graph.trace import Updates
 
 Summary = Mapping[str, Any]
 
@@ -44,6 +45,7 @@ def page(
     evaluation: Any,
     causal: Solution | None,
     scored: Mapping[str, charts.Scored],
+    updates: Updates | None = None,
 ) -> str:
     """The whole HTML text."""
     holes = facts.gaps(summary)
@@ -57,6 +59,7 @@ def page(
         used(session, solution, summary),
         imu_holes(summary, holes),
         *over_time(solution, shaded, causal),
+        section("updates", "While replaying", replays.draw(updates, solution, shaded) if updates is not None else ""),
         withheld(summary, scored, solution, shaded),
         against_reference(evaluation, compared, solution, shaded),
         *machinery(summary),

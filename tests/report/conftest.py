@@ -25,5 +25,6 @@ def page(case: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
         evaluation=case.evaluation,
         causal=case.causal,
         withheld=case.withheld,
+        updates=case.updates,
     )
     return path

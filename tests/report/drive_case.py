@@ -12,6 +12,7 @@ from smartnav_graph.frames import Origin
 from smartnav_graph.session import Device, Session
 from smartnav_graph.solution import Residuals, Solution
 from smartnav_graph.streams import GnssFix, Imu
+from smartnav_graph.trace import Updates
 
 T0 = 46_534_478_375_790
 HOLES = [(36.4, 1.59, "bridged"), (198.7, 1.62, "bridged"), (219.7, 1.5, "bridged"), (307.8, 2.41, "missing")]
@@ -26,6 +27,7 @@ class Drive:
     summary: dict[str, Any]
     evaluation: Any
     withheld: dict[str, Any]
+    updates: Updates
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,7 @@ def drive(n: int = 470) -> Drive:
         summary(n),
         _compared(solution, rng),
         _withheld(solution, rng),
+        _updates(solution, rng),
     )
 
 
@@ -157,6 +160,23 @@ def _compared(solution: Solution, rng: np.random.Generator) -> Compared:
     sigma = solution.sigmas[:, 3:6]
     return Compared(
         solution.t_ns, rng.normal(size=sigma.shape) * sigma, np.abs(rng.normal(size=len(sigma))) * 0.4, sigma
+    )
+
+
+def _updates(solution: Solution, rng: np.random.Generator) -> Updates:
+    n = len(solution)
+    learned = np.stack([0.06 + 0.1 * np.exp(-np.arange(n) / 9), 0.003 + 0.2 * np.exp(-np.arange(n) / 9)], axis=1)
+    return Updates(
+        t_ns=solution.t_ns,
+        solved=np.full(n, 30),
+        relinearised=np.arange(n) % 30,
+        doubted=np.zeros(n, dtype=np.int64),
+        corrected=np.where(np.arange(n) % 50 == 0, 3.0, 1e-15),
+        latency_ms=np.linspace(1.0, 5.0, n),
+        edge=np.zeros(n + 1, dtype=np.int64),
+        past_ns=solution.t_ns[:0],
+        past=np.zeros((0, 3)),
+        states={"gnss_time_offset_s": learned, "vehicle_mount.0": learned},
     )
 
 

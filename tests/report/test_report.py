@@ -155,7 +155,18 @@ def test_sections_stand_in_reading_order(dom) -> None:
             "motion",
             "attitude",
         ),
-        *("biases", "residuals", "withheld", "reference", "states", "start", "solver", "timings", "versions"),
+        *(
+            "biases",
+            "residuals",
+            "updates",
+            "withheld",
+            "reference",
+            "states",
+            "start",
+            "solver",
+            "timings",
+            "versions",
+        ),
     ]
 
 
@@ -278,6 +289,18 @@ def test_careful_noise_is_no_warning_but_told(tmp_path, case) -> None:
     dom = written(tmp_path, case, summary=small)
     assert "No warnings." in words(section(dom, "warnings"))
     assert "The residuals of IMU are smaller than the stated noise explains" in words(section(dom, "used"))
+
+
+def test_updates_of_a_replay(dom, tmp_path, case) -> None:
+    node = section(dom, "updates")
+    rows = {words(row[0]): [words(cell) for cell in row[1:]] for row in node.xpath(".//tbody/tr")}
+    assert rows["Computing time"] == ["3.00 ms", "4.96 ms", "5.00 ms"]  # of 1 .. 5 ms
+    assert rows["Correction of the past"][2] == "3.00 m"
+    titles = [words(t) for t in node.xpath('.//*[local-name()="text"][contains(@class, "ty0")]')]
+    assert titles[0] == "Correction of the past [m]" and titles[-1] == "GNSS time offset [ms]"
+    ticks = node.xpath('(.//svg[contains(@class, "plot")])[1]/*[local-name()="text"][@class="tick ty"]/text()')
+    assert ticks[0] == "0.0001"  # m; rounding errors are not drawn as they are
+    assert not written(tmp_path, case).xpath('//section[@id="updates"]')
 
 
 def test_empty_summary_claims_nothing(tmp_path, case) -> None:
