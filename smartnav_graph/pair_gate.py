@@ -95,8 +95,7 @@ def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tu
     """Matches (padded) that agree with the smoothed states, the verdict on each pair, and the scale of a match's
     sigma: that of their median, the freedom of each pair's pose taken out."""
     pairs = builder.pairs
-    x0, x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
-    shift = None if pairs.shift is None else np.asarray(pairs.padded(pairs.shift))
+    x0, x1, shift = pairs.matches
     white = np.abs(sampson(there.R, there.t, x0, x1, shift=shift).residual) / builder.sigma
     geometry = Geometry.of(pairs, there.R)
     use = (white < GATE * scale) & pairs.there

@@ -149,16 +149,16 @@ class Matched:
     def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float) -> None:
         self.rig, self.sigma, self.use, self.reach, self.there = rig, sigma, use, reach, pairs.there
         self.letters = rig.letters
-        self.x0, self.x1 = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
-        self.shift = None if pairs.shift is None else np.asarray(pairs.padded(pairs.shift))
+        x0, x1, shift = pairs.matches
+        self.x0, self.x1, self.shift = x0.copy(), x1.copy(), None if shift is None else shift.copy()
 
     def see(self, rows: NDArray[np.intp], pairs: Pairs) -> None:
         """Put other coordinates in place of those of pairs (m,), which are `pairs` now."""
         width = pairs.there.shape[1]
-        self.x0[rows, :width], self.x1[rows, :width] = (np.asarray(pairs.padded(x)) for x in (pairs.x0, pairs.x1))
-        if pairs.shift is not None:
+        self.x0[rows, :width], self.x1[rows, :width], shift = pairs.matches
+        if shift is not None:
             self.shift = np.zeros((*self.there.shape, 3)) if self.shift is None else self.shift
-            self.shift[rows, :width] = np.asarray(pairs.padded(pairs.shift))
+            self.shift[rows, :width] = shift
 
     def missed(self, there: Relative, rows: NDArray[np.intp]) -> Sampson:
         """How far all matches of rows (m,) of pairs miss."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.vision.epipolar import rays
+from smartnav_graph.vision.gating import Geometry
 from smartnav_graph.vision.refine import GATE, Matched, angle
 
 Floats = NDArray[np.float64]
@@ -62,16 +63,12 @@ def directions(matched: Matched, R: Floats, spread: float, seed: int) -> Pose:
     With the rotation known every match holds the baseline in a plane, n . t = 0 with n = x0~ x R x1~, and two planes
     meet in a direction. `spread` rad is the sigma of the rotation.
     """
-    a, y = rays(matched.xy0), rays(matched.xy1) @ R.T
-    n, none = np.cross(a, y), np.zeros(len(a))
-    pairs = _samples(len(n), seed)
+    alone = np.ones((1, len(matched.xy0)), dtype=bool)
+    geometry = Geometry(rays(matched.xy0)[None], (rays(matched.xy1) @ R.T)[None], R[None], alone)
+    n, pairs = geometry.normals[0], _samples(len(matched.xy0), seed)
     t = _unit(np.cross(n[pairs[:, 0]], n[pairs[:, 1]]))
-    # the first two components of the lines t x y and R^T (x0~ x t), each linear in t
-    by_first = [np.array([none, y[:, 2], -y[:, 1]]), np.array([-y[:, 2], none, y[:, 0]])]
-    by_second = [np.cross(R[:, 0], a).T, np.cross(R[:, 1], a).T]
-    square = np.sum([(t @ line) ** 2 for line in by_first + by_second], axis=0)
     gate = GATE**2 * (matched.sigma**2 + spread**2)
-    miss = (t @ n.T) ** 2 / np.maximum(square, np.finfo(float).tiny)
+    miss = geometry.square(t[:, None])[:, 0]
     cost = np.where(t.any(axis=1), np.minimum(miss / gate, 1.0).sum(axis=1), np.inf)  # a point matched twice: no t
     best = int(np.argmin(cost))
     return R, np.asarray(t[best] if np.isfinite(cost[best]) else OPTICAL_AXIS)

@@ -14,6 +14,7 @@ a single camera and an IMU, BMVC.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,18 +88,24 @@ class Geometry:
 
     @classmethod
     def of(cls, pairs: Pairs, R: Floats) -> Geometry:
-        a, b = (np.asarray(pairs.padded(rays(x))) for x in (pairs.x0, pairs.x1))
+        a, b = (rays(x) for x in pairs.matches[:2])
         return cls(a, b @ R.transpose(0, 2, 1), R, pairs.there)
 
     def normals_at(self, place: NDArray[np.intp]) -> Floats:
         """Normals (..., n, 3) of one match (..., n) a pair."""
         return np.asarray(self.normals[np.arange(place.shape[-1]), place])
 
+    @cached_property
+    def _lines(self) -> Floats:
+        """(4, n, k, 3): rows whose products with t are the first two components of t x y and of R^T (a x t)."""
+        none = np.zeros_like(self.y[..., 0])
+        first = np.stack([none, self.y[..., 2], -self.y[..., 1]], axis=-1)
+        second = np.stack([-self.y[..., 2], none, self.y[..., 0]], axis=-1)
+        return np.stack([first, second, *(cross(self.R[:, None, :, i], self.a) for i in range(2))])
+
     def scale(self, t: Floats) -> Floats:
         """s^2 (..., n, k) of `epipolar.sampson`, of baselines t (..., n, 3)."""
-        l0 = cross(t[..., None, :], self.y)
-        l1 = cross(self.a, t[..., None, :]) @ self.R
-        return np.asarray((l0[..., :2] ** 2).sum(axis=-1) + (l1[..., :2] ** 2).sum(axis=-1) + 1e-18)
+        return np.asarray(sum(((line @ t[..., None])[..., 0]) ** 2 for line in self._lines) + 1e-18)
 
     def square(self, t: Floats) -> Floats:
         """Squared Sampson residuals (..., n, k) of baselines t (..., n, 3)."""

@@ -61,6 +61,12 @@ class Pairs:
         """Mask (n, k) of the places that hold a match."""
         return self.slots >= 0
 
+    @cached_property
+    def matches(self) -> tuple[Floats, Floats, Floats | None]:
+        """x0, x1 (n, k, 2) and shift (n, k, 3), padded."""
+        x0, x1 = (np.asarray(self.padded(x)) for x in (self.x0, self.x1))
+        return x0, x1, None if self.shift is None else np.asarray(self.padded(self.shift))
+
     def of(self, rows: Ints) -> Pairs:
         """Some of the pairs, in ascending order."""
         chosen = np.isin(self.pair, rows)
