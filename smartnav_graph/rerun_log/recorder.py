@@ -19,6 +19,8 @@ from smartnav_graph.trace import window_of
 Times = NDArray[np.int64]
 
 APPLICATION = "smartnav_graph"
+# Numbers at the axis of a small plot before they run into each other.
+MOST_NUMBERS = 6.5
 
 # Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
 _LEAP_DAYS = (
@@ -143,16 +145,18 @@ class Recorder:
 
 
 def readable(low: float, high: float) -> tuple[float, float]:
-    """A value range with a margin, in which two numbers stand at the axis: a small plot has them at powers of ten."""
-    low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
-    step = 10.0 ** np.ceil(np.log10((high - low) / 4.0))
-    if np.floor(high / step) - np.ceil(low / step) >= 1:
-        return low, high
-    up, down = np.ceil(high / step) * step, np.floor(low / step) * step
-    above = up - high <= low - down
-    low, high = (low, float(up)) if above else (float(down), high)
-    edge = 0.06 * (high - low)  # a number on the very edge is cut off
-    return (low, high + edge) if above else (low - edge, high)
+    """A value range with a margin, in which two numbers stand at the axis: a small plot has them at steps of powers of
+    ten. Without them where that would more than double it."""
+    margin = 0.03 * (high - low)
+    step = 10.0 ** np.ceil(np.log10((high - low + 2 * margin) / MOST_NUMBERS))
+    bottom, top = low - margin, high + margin
+    while np.floor(top / step) - np.ceil(bottom / step) < 1:
+        above, below = step - top % step, bottom % step or step
+        # a number on the very edge would be cut off
+        bottom, top = (bottom, top + above + margin) if above <= below else (bottom - below - margin, top)
+        if top - bottom > 2.0 * (high - low):
+            return low - margin, high + margin
+    return float(bottom), float(top)
 
 
 @contextmanager

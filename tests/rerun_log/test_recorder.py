@@ -110,10 +110,13 @@ def test_importing_the_package_does_not_load_rerun():
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
     [
-        (-1.0, 2.0, (-1.09, 2.09)),  # -1 to 2: four numbers
-        (0.0, 0.07, (-0.0021, 0.1 + 0.06 * 0.1021)),  # 0 and 0.1 instead of 0 alone
-        (-0.061, 0.04, (-0.1 - 0.06 * 0.14303, 0.04303)),
-        (9.79, 9.82, (9.7891, 9.8209)),  # 9.79 to 9.82
+        (-1.0, 2.0, (-1.09, 2.09)),  # -1 to 2
+        (0.0, 0.07, (-0.0021, 0.1021)),  # 0 and 0.1 instead of 0 alone
+        (-0.061, 0.04, (-0.10303, 0.04303)),
+        (-0.45, 0.15, (-0.468, 0.168)),  # -0.4 to 0.1
+        (0.31, 0.39, (0.2976, 0.4024)),  # 0.3 and 0.4
+        (-0.31, 0.29, (-0.328, 0.308)),  # six numbers
+        (-0.35, 0.33, (-0.3704, 0.3504)),  # -1 or 1 would be too far
     ],
 )
 def test_a_small_plot_has_two_numbers_at_its_axis(low, high, expected):
