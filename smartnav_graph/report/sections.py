@@ -207,6 +207,7 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
     if len(solution) < 2:
         return []
     sure = statistics.uncertainty_table(solution).html()
+    sure += '<p class="fine">What determined the state at a time T: smartnav explain RUN --at T.</p>'
     parts = [
         section("uncertainty", "How sure", charts.uncertainty(solution, gaps, causal) + sure),
         section("motion", "Speed and height", charts.motion(solution, gaps)),

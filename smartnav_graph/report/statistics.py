@@ -60,6 +60,7 @@ def key_figures(summary: Mapping[str, Any], sure: Certainty | None) -> list[tupl
 def table(session: Session, solution: Solution, summary: Mapping[str, Any]) -> Table:
     """Times, lengths, speeds, heights and what the IMU felt."""
     rows = [
+        *_when_and_where(session, solution),
         ("Duration", duration(summary.get("duration_s", _span(solution)))),
         ("Distance along the path", distance(summary.get("path_m", solution.path_length()))),
         ("Epochs (keyframes)", count(summary.get("keyframes", len(solution)))),
@@ -70,6 +71,20 @@ def table(session: Session, solution: Solution, summary: Mapping[str, Any]) -> T
         *_felt(session, solution),
     ]
     return Table(("", ""), [Row(cells) for cells in rows])
+
+
+def _when_and_where(session: Session, solution: Solution) -> list[tuple[str, str]]:
+    """Date and place, as far as clock and origin tell them."""
+    rows = []
+    if session.clock_epoch == "unix" and len(solution):
+        stamp = np.datetime_as_string(np.datetime64(int(solution.t_ns[0]), "ns"), unit="s")
+        rows.append(("Begin (UTC)", str(stamp).replace("T", " ")))
+    if solution.origin is not None:
+        o = solution.origin
+        north, east = "N" if o.lat_deg >= 0 else "S", "E" if o.lon_deg >= 0 else "W"
+        place = f"{abs(o.lat_deg):.6f}° {north}, {abs(o.lon_deg):.6f}° {east}, {fixed(o.height_m, 1)} m"
+        rows.append(("Origin of east, north, up", place))
+    return rows
 
 
 def _span(solution: Solution) -> float:

@@ -187,6 +187,17 @@ def test_statistics_of_motion_and_imu(dom, case) -> None:
     assert f"Slower than 0.1 m/s {slow:.1f} s" in text
 
 
+def test_date_and_place_as_far_as_known(tmp_path, case) -> None:
+    begun = 1_748_772_000 * 10**9 - case.solution.t0_ns  # 2025-06-01 10:00
+    later = replace(case.solution, t_ns=case.solution.t_ns + begun, t0_ns=case.solution.t0_ns + begun)
+    unix = case.session.replace(clock_epoch="unix", imu=None, gnss=None)
+    text = words(section(written(tmp_path, case, session=unix, solution=later), "statistics"))
+    assert "Begin (UTC) 2025-06-01 10:00:00" in text
+    assert "Origin of east, north, up 49.011000° N, 8.422800° E, 112.8 m" in text
+    text = words(section(written(tmp_path, case, solution=replace(case.solution, origin=None)), "statistics"))
+    assert "Begin" not in text and "Origin" not in text
+
+
 def test_acceleration_is_over_ground() -> None:
     """A body on its side that is pushed north with 2 m/s^2, its accelerometer biased."""
     turned, bias = Rotation.from_euler("x", 90, degrees=True), np.array([0.1, -0.2, 0.3])
