@@ -107,6 +107,7 @@ class CoplanarityBuilder:
     verdict: NDArray[np.intp] = field(init=False)
     at_once: NDArray[np.intp] = field(init=False)
     rate: Floats = field(init=False)
+    motion: Motion = field(init=False)
     refused: str = ""
     frozen: Relative | None = None
     _keyframe: dict[int, int] = field(default_factory=dict)
@@ -136,10 +137,9 @@ class CoplanarityBuilder:
         if image is None:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
-        if memory.phase == "causal" and previous is not None:
-            self._look_now(image, step, previous)
         ending = self._ending(image)
-        if memory.phase == "causal" and len(ending):
+        if memory.phase == "causal":
+            self._look_now(image, step)
             self._judge_now(self._model(memory), ending)
         self._add_pairs(step, ending, memory)
 
@@ -228,12 +228,12 @@ class CoplanarityBuilder:
         self.motion = motion
         self.pairs = self._at_once(self.seen, offset_s)
 
-    def _look_now(self, image: int, step: Step, previous: State) -> None:
-        """The same at one image of a replay, by what is foretold."""
-        bias = previous.bias.gyroscope()
+    def _look_now(self, image: int, step: Step) -> None:
+        """The same at one image of a replay, by what is foretold there."""
+        motion, bias = self.motion, step.bias.gyroscope()
         self.rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
-        self.motion.nav_R_body[image] = step.predicted.attitude().matrix()
-        self.motion.nav_v_body[image], self.motion.gyro_bias[image] = step.predicted.velocity(), bias
+        motion.nav_R_body[image] = step.predicted.attitude().matrix()
+        motion.nav_v_body[image], motion.gyro_bias[image] = step.predicted.velocity(), bias
 
     def _at_once(self, pairs: Pairs, offset_s: float) -> Pairs:
         """Pairs as they would be had all rows of an image been read at once with its first.
@@ -264,6 +264,8 @@ class CoplanarityBuilder:
     def _judge_now(self, model: RowModel, ending: NDArray[np.intp]) -> None:
         """Judge new pairs by the turn since their first image."""
         assert isinstance(model, PairRows)
+        if not len(ending):
+            return
         C = self.rig.body_R_cam
         turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.pairs.images[ending]]
         some = self._at_once(self.seen.of(ending), 0.0)
