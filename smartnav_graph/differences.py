@@ -62,7 +62,10 @@ class RunDifferences:
         )
 
     def _title(self) -> str:
-        return f"{self.second.path} less {self.first.path} at {len(self.states)} common epochs"
+        counts = [len(run.solution) for run in (self.first, self.second)]
+        few = "; the same --rate HZ gives both more of them" if 2 * len(self.states) < min(counts) else ""
+        common = f"{len(self.states)} common epochs (of {counts[0]} and {counts[1]}{few})"
+        return f"{self.second.path} less {self.first.path} at {common}"
 
     def _states(self) -> Iterator[str]:
         yield f"{'':<16}{''.join(f'{name:>11}' for name in COLUMNS)}"

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.progress import Progress, silent
+from smartnav_graph.progress import Progress, silent, under
 from smartnav_graph.session import Session
 from smartnav_graph.streams import Matches, Reference
 from smartnav_graph.timebase import NS, interpolate, seconds_since
@@ -223,4 +223,5 @@ def compare(
     progress: Progress = silent,
 ) -> list[Score]:
     """`score` of several kinds of features, otherwise alike."""
-    return [score(session, replace(config, features=name), workers=workers, progress=progress) for name in names]
+    kinds = {name: replace(config, features=name) for name in names}
+    return [score(session, kind, workers=workers, progress=under(name, progress)) for name, kind in kinds.items()]
