@@ -18,6 +18,7 @@ from smartnav_graph.timebase import interpolate, seconds_since
 
 Floats = NDArray[np.float64]
 
+HARD = "\u00a0"  # a space that no line breaks at
 AT_S = 300.0
 SLOW_M_S = 0.1
 
@@ -82,7 +83,7 @@ def _when_and_where(session: Session, solution: Solution) -> list[tuple[str, str
     if solution.origin is not None:
         o = solution.origin
         north, east = "N" if o.lat_deg >= 0 else "S", "E" if o.lon_deg >= 0 else "W"
-        place = f"{abs(o.lat_deg):.6f}° {north}, {abs(o.lon_deg):.6f}° {east}, {fixed(o.height_m, 1)} m"
+        place = f"{abs(o.lat_deg):.6f}°{HARD}{north}, {abs(o.lon_deg):.6f}°{HARD}{east}, {fixed(o.height_m, 1)}{HARD}m"
         rows.append(("Origin of east, north, up", place))
     return rows
 

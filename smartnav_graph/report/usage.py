@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.report.facts import Summary, chi2_by_sensor, room, sensor_name, things, withheld_counts
-from smartnav_graph.report.text import DASH, Row, Table, as_float, capital, count, fixed, metres, number, seconds
+from smartnav_graph.report.text import DASH, Row, Table, as_float, capital, count, metres, number, seconds
 from smartnav_graph.solution import Solution
 
 SMALL = 0.3  # chi2 per degree of freedom of noise that is stated too large
@@ -93,7 +93,7 @@ def fates_table(summary: Summary, key: str, things: str) -> Table:
     total = sum(found.values())
     rows = [
         Row(
-            [capital(FATES.get(reason, reason)), count(n), f"{fixed(100 * n / total, 0)} %"],
+            [capital(FATES.get(reason, reason)), count(n), f"{number(100 * n / total, 2)} %"],
             {key.replace("_", "-"): reason, "n": n},
         )
         for reason, n in found.items()

@@ -225,7 +225,7 @@ def test_never_standing_still_is_told(tmp_path, case) -> None:
 def test_image_pairs_have_their_fate(dom) -> None:
     text = words(section(dom, "used"))
     assert "100 image pairs Count Share In use 60 60 % The camera hardly moved between the two 39 39 %" in text
-    assert "Contradict the motion that the other sensors tell 1 1 %" in text
+    assert "Contradict the motion that the other sensors tell 1 1.0 %" in text
 
 
 def test_what_was_assumed_stands_apart(dom) -> None:
