@@ -76,6 +76,7 @@ def test_wrong_observations_are_left_out():
     assert found.summary["rejected"]["tracks"] > 300
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_late_and_reads_row_by_row():
     """Clock 15 ms and boresight off by half a degree, 30 ms of readout: taken off every observation at its point."""
     room = SCENARIOS["room-30s"]
@@ -110,6 +111,7 @@ def test_a_replay_has_pairs_and_its_polish_tracks(room, run):
     np.testing.assert_allclose(replayed.causal.nav_t_body, pairs.causal.nav_t_body, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_images_that_share_a_keyframe_count_once(room):
     """Tracks of a second image 50 us after each: one pose has one observation of a track."""
     tracks = room.tracks
