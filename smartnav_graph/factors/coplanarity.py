@@ -162,7 +162,7 @@ class CoplanarityBuilder:
         if self.replaced(memory):
             return
         verdict = self.verdict_of(memory)
-        ending = ending[np.isin(verdict[ending], [IN_USE, CONTRARY])]
+        ending = ending[(verdict[ending] == IN_USE) | (verdict[ending] == CONTRARY)]
         if not len(ending):
             return
         model, used = self._model(memory), tuple((verdict[ending] == IN_USE).tolist())

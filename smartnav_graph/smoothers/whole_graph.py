@@ -27,18 +27,26 @@ def value_of(values: Any, letter: str, name: int) -> Floats:
 
 
 class Snapshot:
-    """States of gtsam.Values as arrays, each fetched once; held states stand at their constants."""
+    """States of gtsam.Values as arrays, each fetched once; held states stand at their constants. What stacks are
+    linearised to there is kept: a candidate whose cost was found is what the next step is taken from."""
 
     def __init__(self, values: Any, held: Held) -> None:
-        self._values = values
+        self.values = values
         self._found: dict[int, Floats] = dict(held)
+        self._linear: dict[int, tuple[Floats, list[Floats]]] = {}
 
     def column(self, letter: str, names: Sequence[int]) -> Floats:
         """States (m, ...) of one kind."""
         for name in names:
             if name not in self._found:
-                self._found[name] = value_of(self._values, letter, name)
+                self._found[name] = value_of(self.values, letter, name)
         return np.array([self._found[name] for name in names])
+
+    def linearized(self, stack: Stack) -> tuple[Floats, list[Floats]]:
+        """Residuals and Jacobians of a stack."""
+        if id(stack) not in self._linear:
+            self._linear[id(stack)] = stack.model.linearize(stack.states(self), stack.data)
+        return self._linear[id(stack)]
 
 
 class Stack:
@@ -71,18 +79,17 @@ class Stack:
 
         values : gtsam.Values, or a `Snapshot` that stacks share
         """
-        return self.model.linearize(self._states(values), self.data)
+        return (values if isinstance(values, Snapshot) else Snapshot(values, self.held)).linearized(self)
 
-    def _states(self, values: Any) -> list[Floats]:
+    def states(self, snapshot: Snapshot) -> list[Floats]:
         """The states (m, ...) of the rows, one array a letter of the model."""
-        snapshot = values if isinstance(values, Snapshot) else Snapshot(values, self.held)
         columns = zip(self.model.letters, zip(*self.keys, strict=True), strict=True)
         return [snapshot.column(letter, names) for letter, names in columns]
 
     def measured(self, values: Any) -> Measured:
         """Every measurement by itself: the rows, or what they stand for."""
         if hasattr(self.model, "measured"):
-            found: Measured = self.model.measured(self._states(values), self.data)
+            found: Measured = self.model.measured(self.states(Snapshot(values, self.held)), self.data)
             return found._replace(used=found.used & self.used[found.row])
         white, _ = self.linearize(values)
         return Measured(np.arange(len(white)), white, self.weight(white), self.used)
@@ -141,6 +148,7 @@ class WholeGraph:
             self.native.push_back(factor)
         self.held = held
         self.stacks = stacks_of(blocks, held)
+        self._last: Snapshot | None = None
 
     @classmethod
     def of(cls, steps: Sequence[Step]) -> WholeGraph:
@@ -156,15 +164,21 @@ class WholeGraph:
 
     def linearize(self, values: Any) -> Any:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""
-        linear, snapshot = self.native.linearize(values), Snapshot(values, self.held)
+        linear, snapshot = self.native.linearize(values), self._snapshot(values)
         for stack in self.stacks:
             stack.add_to(linear, snapshot)
         return linear
 
     def error(self, values: Any) -> float:
         """Half the sum of weighted squares."""
-        snapshot = Snapshot(values, self.held)
+        snapshot = self._snapshot(values)
         return float(self.native.error(values)) + sum(stack.cost(snapshot) for stack in self.stacks)
+
+    def _snapshot(self, values: Any) -> Snapshot:
+        """The snapshot of the same values that was looked at last, or a new one; nobody changes values in between."""
+        if self._last is None or self._last.values is not values:
+            self._last = Snapshot(values, self.held)
+        return self._last
 
 
 def session_prior(state: SessionState) -> Any:
