@@ -66,13 +66,23 @@ def _judged(builder: SmartBuilder, estimate: Estimate, memory: Memory) -> Memory
     builder.xy = seen.xy + views.keyframe.project(points.point) - views.then.project(points.point)
     builder.refused = _refusal(builder.verdict)
     if builder.refused:
-        return replace(memory, settled={name: n for name, n in memory.settled.items() if name != builder.name})
+        return _without(builder, memory)
     states = [estimate.session[s.name] for s in builder.eye.states().values() if s.name in estimate.session]
     return replace(
         memory,
         held={**memory.held, **{state.name: state.value for state in states}},
         noise_scales={**memory.noise_scales, builder.name: _scale(builder, points)},
         settled={**memory.settled, builder.name: passed + 1},
+    )
+
+
+def _without(builder: SmartBuilder, memory: Memory) -> Memory:
+    """The memory with image pairs in force again, and the camera's states free."""
+    names = {state.name for state in builder.eye.states().values()}
+    return replace(
+        memory,
+        held={name: value for name, value in memory.held.items() if name not in names},
+        settled={name: count for name, count in memory.settled.items() if name != builder.name},
     )
 
 

@@ -14,6 +14,7 @@ from smartnav_graph.graph import KEYFRAME_LETTERS, key
 from smartnav_graph.problem import prepare
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
 from smartnav_graph.smoothers.whole_graph import WholeGraph
+from smartnav_graph.track_gate import chosen
 
 
 def options(**sections):
@@ -126,12 +127,34 @@ def test_images_that_share_a_keyframe_count_once(room):
     assert (builder.sightings.image[used] % 2 == 0).all()
 
 
-def test_marginals_are_those_of_the_whole_system(room):
-    """The recursion over the Bayes net, whose keyframes are tied over many, beside a dense inverse."""
+@pytest.fixture(scope="module")
+def solved(room):
+    """The first seconds: problem, estimate and memory with tracks in force."""
     problem = prepare(room, options(run={"end_s": 9.0}))
     initial = initialise(problem)
     estimate, memory, _ = solve_passes(problem, problem.windows, initial.prior, initial.memory, warm=initial.warm)
     assert memory.settled["smart"] == 2
+    return problem, estimate, memory
+
+
+def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
+    problem, estimate, memory = solved
+    builder = replace(next(b for b in problem.builders if b.name == "smart"))
+    pairs = next(b for b in problem.builders if b.name == "coplanarity")
+    assert pairs.replaced(memory) and "images_time_offset_s" in memory.held
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, builder.sightings.xy.shape)
+    builder.sightings = replace(builder.sightings, xy=xy)
+    first = replace(memory, settled={**memory.settled, "smart": 1})
+    again = chosen([builder, pairs], estimate, first)
+    assert not pairs.replaced(again) and not builder.in_force(again)
+    assert "images_time_offset_s" not in again.held and "camera_boresight_rad" not in again.held
+    assert "too poor to judge them by" in builder.refused
+    assert chosen([builder, pairs], estimate, again) is again
+
+
+def test_marginals_are_those_of_the_whole_system(solved):
+    """The recursion over the Bayes net, whose keyframes are tied over many, beside a dense inverse."""
+    _, estimate, _ = solved
     held = {state.key: state.value for state in estimate.session.values() if state.held}
     linear = WholeGraph([factor for _, factor in estimate.factors], estimate.blocks, held).linearize(estimate.values)
     order = gtsam.Ordering()
