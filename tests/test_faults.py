@@ -12,7 +12,7 @@ from sessions import recorded, with_gnss
 import smartnav_graph as sn
 from smartnav_graph.config import Config
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.report.facts import rejections_table
+from smartnav_graph.report.usage import rejections_table
 from smartnav_graph.simulation.degrade import Degrade, degrade, write_degraded
 from smartnav_graph.simulation.fixes import Outliers
 from smartnav_graph.smoothers.incremental import ReplayConfig
