@@ -265,7 +265,7 @@ def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
         shown,
         _tabs(series(_ACCURACY)),
         _tabs(series(_FOUND) + series(_clocks(recorder))),
-        _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(solution)]),
+        _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(recorder, solution)]),
         states,
         log,
     ]
@@ -283,14 +283,20 @@ def _clocks(recorder: Recorder) -> Names:
     return tuple((f"Clock offset of {sensor} s, bands 1σ 3σ", f"/clock/{sensor}") for sensor in sensors)
 
 
-def _residuals(solution: Solution | None) -> list[Any]:
+def _residuals(recorder: Recorder, solution: Solution | None) -> list[Any]:
     if solution is None:
         return []
     sensors = signals.sensors_of(solution.residuals)
     # Position sensors tell most: they stand first; the inertial residuals are many and small.
     sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
-        series_view(f"Residuals {name} (σ)", [f"/residuals/{name}/**"], legend=_few(solution, name)) for name in sensors
+        series_view(
+            f"Residuals {name} (σ)",
+            [f"/residuals/{name}/**"],
+            legend=_few(solution, name),
+            limits=recorder.limits.get(f"/residuals/{name}"),
+        )
+        for name in sensors
     ]
 
 

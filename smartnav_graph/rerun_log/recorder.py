@@ -21,6 +21,8 @@ Times = NDArray[np.int64]
 APPLICATION = "smartnav_graph"
 # Numbers at the axis of a small plot before they run into each other.
 MOST_NUMBERS = 6.5
+# How many times larger than what it shows a plot may be for the sake of a second number.
+MOST_ROOM = 1.7
 
 # Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
 _LEAP_DAYS = (
@@ -146,7 +148,7 @@ class Recorder:
 
 def readable(low: float, high: float) -> tuple[float, float]:
     """A value range with a margin, in which two numbers stand at the axis: a small plot has them at steps of powers of
-    ten. Without them where that would more than double it."""
+    ten. Without them where that would leave it half empty."""
     margin = 0.03 * (high - low)
     step = 10.0 ** np.ceil(np.log10((high - low + 2 * margin) / MOST_NUMBERS))
     bottom, top = low - margin, high + margin
@@ -154,7 +156,7 @@ def readable(low: float, high: float) -> tuple[float, float]:
         above, below = step - top % step, bottom % step or step
         # a number on the very edge would be cut off
         bottom, top = (bottom, top + above + margin) if above <= below else (bottom - below - margin, top)
-        if top - bottom > 2.0 * (high - low):
+        if top - bottom > MOST_ROOM * (high - low):
             return low - margin, high + margin
     return float(bottom), float(top)
 

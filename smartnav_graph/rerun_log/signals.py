@@ -16,6 +16,7 @@ from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solut
 Floats = NDArray[np.float64]
 
 MARKER_SIZE = 2.0
+MANY = 500
 EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
 
 
@@ -140,22 +141,44 @@ def sensors_of(residuals: Residuals) -> list[str]:
 
 def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
     """Whitened residuals a sensor: /residuals/<sensor>, and what was not used at /residuals/<sensor>/rejected."""
+    for sensor in sensors_of(residuals):
+        path = f"/residuals/{sensor}"
+        used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
+        width = used[1].shape[1]
+        names = [axis_name(k, width) for k in range(width)]
+        _log_points(recorder, path, *used, names, colours.of_axes(width), ("circle", MARKER_SIZE))
+        # crosses, small ones where there are so many that they would cover all else
+        cross = "cross", (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
+        red = [colours.REJECTED] * width
+        _log_points(recorder, f"{path}/rejected", *rejected, ["rejected"] * width, red, cross)
+        if len(rejected[0]):
+            limit = _limit(np.abs(used[1]), np.abs(rejected[1]))
+            recorder.limits[path] = readable(-limit, limit)
+
+
+def _limit(used: Floats, rejected: Floats) -> float:
+    """How far a plot of residuals reaches: what is used must still be seen where what was rejected is large."""
+    inside = float(np.nanpercentile(used, 99.9)) if np.isfinite(used).any() else 3.0
+    return max(1.2 * inside, min(1.1 * float(np.nanpercentile(rejected, 75)), 5.0 * inside))
+
+
+def _log_points(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    names: list[str],
+    colors: list[list[int]],
+    marker: tuple[str, float],
+) -> None:
     import rerun as rr
 
-    for sensor in sensors_of(residuals):
-        for path, used in ((f"/residuals/{sensor}", True), (f"/residuals/{sensor}/rejected", False)):
-            t, table = residual_rows(residuals, sensor, used)
-            width = table.shape[1]
-            names = [axis_name(k, width) if used else "rejected" for k in range(width)]
-            recorder.rows(path, t, rr.Scalars.columns(scalars=table))
-            if len(t):
-                style = rr.SeriesPoints(
-                    colors=colours.of_axes(width) if used else [colours.REJECTED] * width,
-                    names=names,
-                    markers=["circle" if used else "cross"] * width,
-                    marker_sizes=[MARKER_SIZE if used else 2.5 * MARKER_SIZE] * width,
-                )
-                recorder.style(path, style)
+    shape, size = marker
+    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
+    if len(t_ns):
+        count = len(names)
+        style = rr.SeriesPoints(colors=colors, names=names, markers=[shape] * count, marker_sizes=[size] * count)
+        recorder.style(path, style)
 
 
 def axis_name(axis: int, width: int) -> str:

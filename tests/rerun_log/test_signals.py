@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from recordings import (
     EVALUATION,
     make_session,
@@ -62,3 +63,10 @@ def test_motion_is_the_solution(recording):
     )
     speed = np.linalg.norm(solution.nav_v_body, axis=1)
     np.testing.assert_array_equal(shown, np.column_stack([angles, solution.nav_t_body[:, 2], speed]))
+
+
+def test_gross_errors_do_not_flatten_what_is_used():
+    used = np.linspace(-3.0, 3.0, 1001)
+    assert signals._limit(np.abs(used), np.array([1500.0, 900.0, 20.0])) == pytest.approx(15.0, rel=0.01)
+    assert signals._limit(np.abs(used), np.array([4.0, 5.0])) == pytest.approx(1.1 * 4.75, rel=0.01)
+    assert signals._limit(np.array([np.nan]), np.array([40.0])) == pytest.approx(15.0)
