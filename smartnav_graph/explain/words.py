@@ -11,6 +11,7 @@ from smartnav_graph.explain.figures import (
     DIRECTION,
     HEIGHT,
     LEVEL_PLACE,
+    NO_ROWS,
     PLACE,
     QUANTITIES,
     RESTS,
@@ -63,7 +64,7 @@ def sentences(found: Explanation, near: Nearby) -> list[str]:
     """What a surveyor asks first, in order."""
     told = [_instant(found), _known(found)]
     told += [_made_of(found, quantity) for quantity in (LEVEL_PLACE, HEIGHT, DIRECTION)]
-    told += [_reach(found), *_rests(found), _here(found), *_measured(found, near), _pulled(found)]
+    told += [_reach(found), *_rests(found), _here(found), *_measured(found, near), *_pulled(found)]
     return [*told, *_around(near)]
 
 
@@ -170,27 +171,37 @@ def _sides(before: float | None, after: float | None) -> str:
     return ", ".join(f"{away:.2f} s {side}" if away else "at it" for away, side in sides if away is not None)
 
 
-def _pulled(found: Explanation) -> str:
-    """By the measurement that pulls most, in one direction or in heading."""
+def _pulled(found: Explanation) -> Iterator[str]:
+    """By the source, and by the single measurement, that pull most."""
     if not found.balanced:
-        return (
+        yield (
             "The states of this replay were never solved together (no polish): the figures say what all data together "
             "tell, and pulls are left out."
         )
-    m, sigma = found.held.measurements, found.held.sigma
-    felt = [i for i in found.strongest() if np.abs(m.pull[i, 2:6]).max() >= FELT]
+        return
+    h, m = found.held, found.held.measurements
+    sources = [i for i, source in enumerate(h.sources) if source not in NO_ROWS and _felt(h.pull[i])]
+    if sources:
+        most = max(sources, key=lambda i: float(np.abs(h.pull[i, 2:6]).max()))
+        yield f"Together {words(h.sources[most])} pull it {_pull(found, h.pull[most])}; all else holds against them."
+    felt = [i for i in found.strongest() if _felt(m.pull[i])]
     if not felt:
-        return f"No single measurement pulls by {FELT} sigma."
-    pull = m.pull[felt[0]]
+        yield f"No single measurement pulls by {FELT} sigma."
+        return
+    source, when = words(str(m.source[felt[0]])).removeprefix("the "), found.seconds(int(m.t_ns[felt[0]]))
+    yield f"The strongest pull of one measurement, of {source} at {when:.2f} s: {_pull(found, m.pull[felt[0]])}."
+
+
+def _felt(pull: Floats) -> bool:
+    """Whether a pull (15,) moves the place or the heading at all."""
+    return bool(np.abs(pull[2:6]).max() >= FELT)
+
+
+def _pull(found: Explanation, pull: Floats) -> str:
     level, turn = float(np.hypot(*pull[3:5])), -float(pull[2])
-    where = f"{level:.2f} sigma ({_metres(float(np.hypot(*(pull * sigma)[3:5])))}) to the {_wind(*pull[3:5])}"
+    metres = _metres(float(np.hypot(*(pull * found.held.sigma)[3:5])))
     side = "clockwise" if turn > 0 else "anticlockwise"
-    source = words(str(m.source[felt[0]])).removeprefix("the ")
-    when = found.seconds(int(m.t_ns[felt[0]]))
-    return (
-        f"The strongest pull of a single measurement, of {source} at {when:.2f} s: {where}, "
-        f"{abs(turn):.2f} sigma {side} in heading; the others hold against it."
-    )
+    return f"{level:.2f} sigma ({metres}) to the {_wind(*pull[3:5])} and {abs(turn):.2f} sigma {side} in heading"
 
 
 def _around(near: Nearby) -> Iterator[str]:
