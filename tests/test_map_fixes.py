@@ -14,6 +14,7 @@ from smartnav_graph.frames import Origin
 from smartnav_graph.run_folder import read_run
 from smartnav_graph.session import save as save_session
 from smartnav_graph.simulation.scenarios import simulate
+from smartnav_graph.streams import PoseFix
 
 # nav -> the model: another scale, frame and origin; noise of its poses
 SCALE, MAP_R_NAV, MAP_T_NAV = 0.21, Rotation.from_euler("xyz", [70, -20, 140], degrees=True), np.array([5.0, 2.0, -3.0])
@@ -104,6 +105,17 @@ def test_a_run_without_a_model_is_nothing(workshop, capsys):
     folder, _ = workshop
     assert main(["match", f"{folder}/room", "--known", f"{folder}/without"]) == 1
     assert "--known: is given without --map" in capsys.readouterr().err
+
+
+def test_fixes_of_others_are_not_lost(workshop, capsys, tmp_path):
+    folder, room = workshop
+    for source in (None, np.array(["total station"], dtype=object)):
+        fixes = PoseFix(t_ns=room.images.t_ns[:1], enu=np.zeros((1, 3)), source=source)
+        save_session(room.replace(pose_fixes=fixes), tmp_path / "room", force=True)
+        told = ["match", f"{tmp_path}/room", "--map", f"{folder}/model", "--known", f"{folder}/without", "--force"]
+        assert main(told) == 1
+        assert "which --force would lose" in capsys.readouterr().err
+        assert len(sn.load(f"{tmp_path}/room").pose_fixes) == 1
 
 
 def test_a_run_in_another_frame_is_refused(workshop, capsys, tmp_path):

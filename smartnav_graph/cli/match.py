@@ -25,7 +25,7 @@ from smartnav_graph.vision import features as kinds
 from smartnav_graph.vision import kept, match_file
 from smartnav_graph.vision.benchmark import Published, Score
 from smartnav_graph.vision.front_end import FrontEndConfig
-from smartnav_graph.vision.map import Known, own_fixes, pose_fixes
+from smartnav_graph.vision.map import SOURCE, Known, own_fixes, pose_fixes
 
 FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 
@@ -156,6 +156,7 @@ class Match(Command):
         folder = Path(self.session)
         session = session_model.load(folder)
         kept.refuse_others(folder, "pose_fixes", self.force)
+        refuse_foreign_fixes(folder, session)
         known = own_fixes(session) if self.known is None else self._known(self.known, session)
         found = pose_fixes(path, session, known)
         told = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": found.similarity.sigma}
@@ -198,6 +199,17 @@ class Match(Command):
 
     def _print_json(self, value: Any) -> None:
         print(json.dumps(plain(value), allow_nan=False))
+
+
+def refuse_foreign_fixes(folder: Path, session: Session) -> None:
+    """Raise where the session's pose fixes are not those of a model, which may be made again."""
+    fixes = session.pose_fixes
+    sources = set() if fixes is None else {"nobody"} if fixes.source is None else set(fixes.source)
+    if sources - {SOURCE}:
+        found = f"holds pose fixes of {', '.join(sorted(map(str, sources - {SOURCE})))}, which --force would lose"
+        raise SessionError(
+            folder / "pose_fixes.parquet", found, "none, or those of a model", "use a copy of the session"
+        )
 
 
 def map_text(path: Path, told: Mapping[str, Any]) -> str:
