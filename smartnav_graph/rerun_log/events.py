@@ -21,9 +21,9 @@ USED, REJECTED, WITHHELD = 0, 1, 2
 
 @dataclass(frozen=True)
 class Events:
-    """Stretches in which something is missing or stands still, and for every GNSS fix what became of it.
+    """Stretches in which something is missing or stands still, and what became of every row that tells a position.
 
-    fix_use (n_fixes,): USED, REJECTED, or WITHHELD (it has no residual: kept back, or outside the solution).
+    use : by stream, (n,) USED, REJECTED, or WITHHELD (it has no residual: kept back, or outside the solution).
     """
 
     t0_ns: int
@@ -32,14 +32,14 @@ class Events:
     gaps: list[Gap]
     outages: list[Gap]
     standstills: list[Gap]
-    fix_use: NDArray[np.int64]
+    use: Mapping[str, NDArray[np.int64]]
 
 
 def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]) -> Events:
     """Everything a session, its solution and its summary tell of stretches of time."""
     start, end = span(session, solution)
-    use = fix_use(session.gnss, solution)
-    fixes = session.gnss.t_ns[use == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
+    use = {name: fix_use(stream, solution) for name, stream in session.absolute().items()}
+    fixes = session.gnss.t_ns[use["gnss"] == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
     return Events(
         t0_ns=session.t0_ns,
         start_ns=start,
@@ -47,7 +47,7 @@ def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]
         gaps=imu_gaps(session, summary),
         outages=silences(fixes, start, end) if session.gnss is not None else [],
         standstills=_standstills(session, summary),
-        fix_use=use,
+        use=use,
     )
 
 
@@ -85,14 +85,12 @@ def imu_gaps(session: Session, summary: Mapping[str, Any]) -> list[Gap]:
     return find_gaps(session.imu.t_ns, np.concatenate([session.imu.gyro, session.imu.accel], axis=1))
 
 
-def fix_use(fixes: Stream | None, solution: Solution | None) -> NDArray[np.int64]:
-    """USED, REJECTED or WITHHELD for every fix, by the residual nearest in time (n,).
+def fix_use(fixes: Stream, solution: Solution | None) -> NDArray[np.int64]:
+    """USED, REJECTED or WITHHELD for every row of positions, by the residual nearest in time (n,).
 
     Residuals may stand on the inertial clock and fixes on the receiver's, a time offset apart: a residual belongs to
     a fix within 0.4 fix periods.
     """
-    if fixes is None:
-        return np.zeros(0, dtype=np.int64)
     use = np.full(len(fixes), USED, dtype=np.int64)
     rows: Residuals | None = None if solution is None else solution.residuals
     mine = np.zeros(0, dtype=bool) if rows is None else rows.of(fixes.NAME)

@@ -239,8 +239,8 @@ def log_fixes(scene: Scene, events: Events) -> None:
             ("withheld", WITHHELD, colours.WITHHELD, 2.0),
             ("rejected", REJECTED, colours.REJECTED, 4.5),
         ):
-            scene.points(f"gnss/{name}", enu[events.fix_use == use], colour, size)
-        used = events.fix_use == USED
+            scene.points(f"gnss/{name}", enu[events.use["gnss"] == use], colour, size)
+        used = events.use["gnss"] == USED
         t = session.gnss.t_ns[used]
         recorder.rows("/world/gnss/current", t, rr.Points3D.columns(positions=scene.local(enu[used])))
         style = rr.Points3D.from_fields(colors=colours.FIX, radii=rr.Radius.ui_points(6.0))
@@ -252,3 +252,6 @@ def log_fixes(scene: Scene, events: Events) -> None:
         names, first = np.unique(session.control.point_id.astype(str), return_index=True)
         enu = session.nav_position(session.control)[first]
         scene.points("control", enu, colours.CONTROL, 5.0, [str(name) for name in names])
+    others = [stream for name, stream in session.absolute().items() if name != "gnss"]
+    rejected = [session.nav_position(stream)[events.use[stream.NAME] == REJECTED] for stream in others]
+    scene.points("rejected", np.concatenate([np.zeros((0, 3)), *rejected]), colours.REJECTED, 6.0)

@@ -10,6 +10,7 @@ import numpy as np
 from smartnav_graph.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.session import Session
+from smartnav_graph.streams import Stream
 from smartnav_graph.timebase import Gap, seconds_since
 
 MOST_LINES_A_KIND = 200
@@ -29,6 +30,7 @@ _LEGEND = {
     "/world/gnss/fixes": "**green points**, GNSS fixes; large: the latest one",
     "/world/gnss/withheld": "**violet points**, fixes that are not in the solution (withheld, or outside it)",
     "/world/gnss/rejected": "**red points**, rejected fixes",
+    "/world/rejected": "**red points**, rejected positions of other kinds",
     "/world/pose_fixes": "**cyan points**, position fixes from elsewhere",
     "/world/control": "**pink points**, surveyed points",
 }
@@ -44,23 +46,25 @@ Line = tuple[int, str, str]
 
 
 def log_status(recorder: Recorder, session: Session, events: Events) -> None:
-    """What was there when: /status/imu, /status/gnss, /status/gnss_gate, /status/motion."""
+    """What was there when: /status/imu, /status/gnss, /status/motion, and /status/<sensor>_gate where rows of positions
+    were rejected."""
     if session.imu is not None:
         _log_state(recorder, "/status/imu", events, events.gaps, "recorded")
     if session.gnss is not None:
         _log_state(recorder, "/status/gnss", events, events.outages, "fix")
-        rejections = _rejections(session, events)
+    for name, stream in session.absolute().items():
+        rejections = _rejections(stream, events)
         if rejections:
-            _log_state(recorder, "/status/gnss_gate", events, rejections, "accepted")
+            _log_state(recorder, f"/status/{name}_gate", events, rejections, "accepted")
     if events.standstills:
         _log_state(recorder, "/status/motion", events, events.standstills, "moving")
 
 
-def _rejections(session: Session, events: Events) -> list[Gap]:
-    """From each rejected fix to the next fix."""
-    assert session.gnss is not None
-    t = np.concatenate([session.gnss.t_ns, [max(events.end_ns, int(session.gnss.t_ns[-1]))]])
-    return [Gap(int(t[i]), int(t[i + 1]), "rejected") for i in np.flatnonzero(events.fix_use == REJECTED)]
+def _rejections(stream: Stream, events: Events) -> list[Gap]:
+    """From each rejected row to the next."""
+    t = np.concatenate([stream.t_ns, [max(events.end_ns, int(stream.t_ns[-1]))]])
+    rejected = np.flatnonzero(events.use[stream.NAME] == REJECTED)
+    return [Gap(int(t[i]), int(t[i + 1]), "rejected") for i in rejected]
 
 
 def _log_state(recorder: Recorder, path: str, events: Events, spans: list[Gap], between: str) -> None:
@@ -118,11 +122,11 @@ def _happenings(session: Session, events: Events) -> list[Line]:
         [(g.start_ns, "WARN", f"gnss: no fix used for {g.length_s:.1f} s") for g in events.outages],
         [(g.start_ns, "INFO", f"standstill of {g.length_s:.1f} s") for g in events.standstills],
     ]
-    if session.gnss is not None:
+    for name, stream in session.absolute().items():
         for use, level, what in ((REJECTED, "WARN", "fix rejected"), (WITHHELD, "INFO", "fix not in the solution")):
-            times = session.gnss.t_ns[events.fix_use == use]
+            times = stream.t_ns[events.use[name] == use]
             seconds = seconds_since(times, session.t0_ns)
-            kinds.append([(int(t), level, f"gnss: {what} at {s:.2f} s") for t, s in zip(times, seconds, strict=True)])
+            kinds.append([(int(t), level, f"{name}: {what} at {s:.2f} s") for t, s in zip(times, seconds, strict=True)])
     return [line for lines in kinds for line in _capped(lines)]
 
 

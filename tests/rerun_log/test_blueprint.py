@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from recordings import (
-    truth,
-    write,
-)
+import pytest
+from recordings import T0, make_session, make_solution, truth, write
 
-from smartnav_graph.rerun_log import blueprint, spatial
+from smartnav_graph.rerun_log import blueprint, recorder, spatial
 
 
 def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
@@ -42,3 +40,20 @@ def test_eye_sees_every_point():
         half = np.tan(np.radians(55.0 / 2))
         assert (depth > 0).all() and (np.abs(y) < half * depth).all() and (np.abs(x) < 1.6 * half * depth).all()
         assert max((np.abs(y) / depth).max() / half, (np.abs(x) / depth).max() / half / 1.6) > 0.8  # and is near
+
+
+@pytest.mark.parametrize(
+    ("paths", "gnss", "solved", "kind", "first"),
+    [
+        ({"/imu/accel", "/temperature"}, False, False, "calibration", None),
+        ({"/imu/accel", "/world/gnss/fixes"}, True, False, "session", None),
+        ({"/world/est/body", "/motion/speed"}, True, True, "car", "/motion/speed"),
+        ({"/world/est/body", "/motion/height"}, False, True, "indoor", "/motion/height"),
+        ({"/world/est/body", "/world/est/body/cam0/image"}, True, True, "vision", "/motion/attitude"),
+    ],
+)
+def test_layout_goes_by_what_the_session_holds(paths, gnss, solved, kind, first):
+    session = make_session() if gnss else make_session(gnss=None)
+    held = recorder.Recorder(None, recorder.Clock(T0), paths=paths)
+    assert blueprint.kind_of(held, session, make_solution() if solved else None) == kind
+    assert blueprint._FIRST.get(kind) == first

@@ -10,10 +10,14 @@ from recordings import (
     REJECTED_ROWS,
     make_session,
     make_solution,
+    stamps,
+    truth,
+    write,
 )
 
 from smartnav_graph.rerun_log import events
 from smartnav_graph.solution import Residuals
+from smartnav_graph.streams import ControlPoint
 from smartnav_graph.timebase import NS, Gap
 
 
@@ -69,3 +73,25 @@ def test_states_between_touching_spans():
         (20, "b"),
         (30, "moving"),
     ]
+
+
+def test_rejected_points_of_other_kinds_are_marked_too(tmp_path):
+    control = ControlPoint(
+        t_ns=stamps([5.0, 15.0, 25.0]), enu=truth(np.array([5.0, 15.0, 25.0])), point_id=np.array(["A", "B", "C"])
+    )
+    residuals = Residuals(
+        t_ns=np.repeat(control.t_ns, 3),
+        sensor=np.array(["control"] * 9, dtype=object),
+        axis=np.tile([0, 1, 2], 3),
+        whitened=np.ones(9),
+        weight=np.ones(9),
+        used=np.repeat([True, False, True], 3),
+    )
+    session = make_session(gnss=None, control=control)
+    found = write(tmp_path / "run.rrd", session=session, solution=make_solution(residuals=residuals))
+    assert found.texts("/status/control_gate", "StateChange:state") == ["accepted", "rejected", "accepted"]
+    when = found.index("/status/control_gate", "StateChange:state", "elapsed") / NS
+    assert when.tolist() == [0.0, 15.0, 25.0]
+    drawn = found.values("/world/rejected", "Points3D:positions", static=True)[0]
+    np.testing.assert_array_equal(drawn, control.enu[1:2].astype(np.float32))
+    assert "control: fix rejected at 15.00 s" in found.texts("/log", "TextLog:text")

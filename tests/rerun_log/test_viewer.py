@@ -31,6 +31,9 @@ def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):
     assert [file.rsplit("/", 1)[-1] for file in opened[0][1:]] == ["--bind", "127.0.0.1", "0.rrd", "run.rrd"]
     viewer.view([tmp_path / "run"], web=True)
     assert "--web-viewer" in opened[1]
+    (tmp_path / "run" / "latency.rrd").write_bytes(b"")  # of a replay
+    viewer.view([tmp_path / "run"], web=True)
+    assert [file.rsplit("/", 1)[-1] for file in opened[2][-2:]] == ["run.rrd", "latency.rrd"]
 
 
 def test_view_says_what_is_wrong(tmp_path, monkeypatch):
