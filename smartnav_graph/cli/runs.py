@@ -12,7 +12,7 @@ import tyro
 
 from smartnav_graph import estimate, readers
 from smartnav_graph.calibration import model as calibration_model
-from smartnav_graph.cli.options import Estimating, Writing, given, repairs
+from smartnav_graph.cli.options import Estimating, RunPath, Writing, given, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.config import Config
@@ -95,7 +95,7 @@ class Export(Writing):
     Example: smartnav export kitti-run --format tum --out kitti.tum
     """
 
-    run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")]
+    run_path: RunPath
     """Run folder."""
     format: Literal["tum", "kml", "geojson", "gpx", "csv", "images"]
     """The format; kml, geojson, gpx and images need an origin."""
@@ -119,14 +119,17 @@ class Export(Writing):
         if source is None or not Path(source).exists():
             found = "does not say where its session is" if source is None else f"came from {source}, which is not there"
             raise SessionError(self.run_path, found, "a session with pictures", "give --session")
-        done = export_pictures(
-            run.named(self.solution),
-            readers.load(source),
-            self.out,
-            calibration=calibration_model.load(self.run_path / "calibration.toml"),
-            states=run.summary.get("states"),
-            force=self.force,
-        )
+        with progress(self.quiet) as show:
+            show(f"reading {source}", 0, 0)
+            done = export_pictures(
+                run.named(self.solution),
+                readers.load(source),
+                self.out,
+                calibration=calibration_model.load(self.run_path / "calibration.toml"),
+                states=run.summary.get("states"),
+                force=self.force,
+                progress=show,
+            )
         print(f"images: {done.written} in {self.out}, with geotags.csv")
         for reason, n in done.left_out.items():
             print(f"left out: {n} ({reason})", file=sys.stderr)

@@ -29,6 +29,7 @@ from smartnav_graph.export.exif import with_exif
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.frames import LocalFrame
+from smartnav_graph.progress import Progress, silent, watched
 from smartnav_graph.session import Session
 from smartnav_graph.solution import POS, Solution
 from smartnav_graph.timebase import interpolate, ns_from_seconds, seconds_since
@@ -75,6 +76,7 @@ def export_pictures(
     calibration: Calibration | None = None,
     states: Mapping[str, Any] | None = None,
     force: bool = False,
+    progress: Progress = silent,
 ) -> Geotags:
     """Write a folder of copies with EXIF position and direction, and a table of the same; originals are only read.
 
@@ -85,6 +87,7 @@ def export_pictures(
     calibration : of the run, for the clock offset of the camera; the session's own by default
     states : of the run's summary: clock offset and boresight found beside the calibration
     force : replace an older folder of the same kind
+    progress : told of every picture
 
     Raises
     ------
@@ -114,7 +117,7 @@ def export_pictures(
         folder.mkdir()
         left_out = {"outside the run": int((~inside).sum())}
         rows = []
-        for picture, place in zip(taken, where, strict=True):
+        for picture, place in watched("copying pictures", list(zip(taken, where, strict=True)), progress):
             fault = _copy(picture, place, folder, absolute)
             if fault:
                 left_out[fault] = left_out.get(fault, 0) + 1
