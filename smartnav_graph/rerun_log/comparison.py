@@ -23,7 +23,7 @@ from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, VEL, Solution
 Floats = NDArray[np.float64]
 
 FIRST, SECOND = colours.ESTIMATE, [255, 160, 60]
-APART = [230, 230, 230]
+APART = [150, 150, 150]
 MOST_LINES = 2000
 # The largest differences that are marked, and the share of the run between them.
 MARKED, MARKED_APART = 5, 0.04
@@ -142,7 +142,9 @@ def _log_largest(recorder: Recorder, comparison: Comparison, extent: Extent) -> 
         for i, (row, t, m, d) in enumerate(zip(rows, seconds, metres, turns, strict=True))
     ]
     told.sort(key=lambda line: line[0])
-    recorder.rows("/log", [t for t, _ in told], rr.TextLog.columns(text=[text for _, text in told]))
+    recorder.rows(
+        "/log", [t for t, _ in told], rr.TextLog.columns(text=[text for _, text in told], level=["INFO"] * len(told))
+    )
 
 
 def _blueprint(
@@ -152,7 +154,7 @@ def _blueprint(
     import rerun.blueprint as rrb
     from rerun.encodings import AbsoluteTimeRange
 
-    title = f"{names[0]} blue, {names[1]} orange, white: their difference ×{factor:g}"
+    title = f"{names[0]} blue, {names[1]} orange, grey: their difference ×{factor:g}"
     scene = blueprint.world_view(title, extent, np.array([0.2, 0.35, -0.9]), [0.0, 0.0, 1.0])
     log = rrb.TextLogView(name="Largest differences: click a time", origin="/log", columns=blueprint.log_columns())
     table = [rrb.TextDocumentView(name="Figures", origin="/report")] if recorder.has("/report") else []
