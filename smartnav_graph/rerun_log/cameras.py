@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,8 +86,9 @@ def _log_frustum(recorder: Recorder, session: Session, view: CameraView, size: f
     import rerun as rr
 
     mount, camera = session.mount(view.name), view.camera
+    there: list[Any] = []
     if view.root.startswith(BODY):
-        recorder.style(view.root, rr.Transform3D(translation=mount.body_t, mat3x3=mount.body_R))
+        there.append(rr.Transform3D(translation=mount.body_t, mat3x3=mount.body_R))
     if camera is not None:
         pinhole = rr.Pinhole(
             image_from_camera=camera.matrix + np.array([[0, 0, HALF_PIXEL], [0, 0, HALF_PIXEL], [0, 0, 0]]),
@@ -95,7 +97,9 @@ def _log_frustum(recorder: Recorder, session: Session, view: CameraView, size: f
             image_plane_distance=FRUSTUM * size,
             color=colours.CAMERA,
         )
-        recorder.static(view.root, pinhole)
+        there.append(pinhole)
+    if there:
+        recorder.style(view.root, *there)
 
 
 def _log_images(recorder: Recorder, session: Session, found: list[CameraView], end_ns: int) -> list[str]:

@@ -98,9 +98,9 @@ class Recorder:
         self.stream.log(path, *archetypes, static=True, strict=True)
         self.paths.add(path)
 
-    def style(self, path: str, archetype: Any) -> None:
-        """Static colours and names of an entity whose data are rows."""
-        self.stream.log(path, archetype, static=True, strict=True)
+    def style(self, path: str, *archetypes: Any) -> None:
+        """Static colours and names of an entity whose data are rows; once an entity, as two would come in any order."""
+        self.stream.log(path, *archetypes, static=True, strict=True)
 
     def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[Any]) -> None:
         """One row a time stamp; nothing is written without rows."""

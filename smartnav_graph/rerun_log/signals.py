@@ -110,7 +110,8 @@ def _log_error(recorder: Recorder, evaluation: Any) -> None:
         log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m")
     rotation = getattr(evaluation, "rotation_error_deg", None)
     if rotation is not None and np.isfinite(rotation).any():
-        _log_lines(recorder, "/error/rotation", t, np.asarray(rotation)[:, None], ["rotation"])
+        known = np.isfinite(rotation)
+        _log_lines(recorder, "/error/rotation", t[known], np.asarray(rotation)[known, None], ["rotation"])
 
 
 def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:
@@ -146,11 +147,11 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
         used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
         width = used[1].shape[1]
         names = [axis_name(k, width) for k in range(width)]
-        _log_points(recorder, path, *used, names, colours.of_axes(width), ("circle", MARKER_SIZE))
+        _log_axes(recorder, path, *used, names, colours.of_axes(width), ("circle", MARKER_SIZE))
         # crosses, small ones where there are so many that they would cover all else
         cross = "cross", (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
         red = [colours.REJECTED] * width
-        _log_points(recorder, f"{path}/rejected", *rejected, ["rejected"] * width, red, cross)
+        _log_axes(recorder, f"{path}/rejected", *rejected, ["rejected"] * width, red, cross)
         if len(rejected[0]):
             limit = _limit(np.abs(used[1]), np.abs(rejected[1]))
             recorder.limits[path] = readable(-limit, limit)
@@ -160,6 +161,26 @@ def _limit(used: Floats, rejected: Floats) -> float:
     """How far a plot of residuals reaches: what is used must still be seen where what was rejected is large."""
     inside = float(np.nanpercentile(used, 99.9)) if np.isfinite(used).any() else 3.0
     return max(1.2 * inside, min(1.1 * float(np.nanpercentile(rejected, 75)), 5.0 * inside))
+
+
+def _log_axes(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    names: list[str],
+    colors: list[list[int]],
+    marker: tuple[str, float],
+) -> None:
+    """Points of all axes in one entity, or each in its own where rows have not the same axes: two recordings with NaN
+    in them never compare equal."""
+    there = np.isfinite(values)
+    if there.all():
+        _log_points(recorder, path, t_ns, values, names, colors, marker)
+        return
+    for k, mask in enumerate(there.T):
+        rows = t_ns[mask], values[mask, k : k + 1]
+        _log_points(recorder, f"{path}/{k}", *rows, names[k : k + 1], colors[k : k + 1], marker)
 
 
 def _log_points(

@@ -29,7 +29,9 @@ def log_states(
         path = f"/clock/{name.removesuffix(CLOCK)}"
         followed = None if updates is None else updates.states.get(name)
         if updates is not None and followed is not None:
-            log_bands(recorder, path, updates.t_ns, followed[:, :1], followed[:, 1:], ["offset"], "s")
+            known = np.isfinite(followed[:, 0])
+            t_ns, followed = updates.t_ns[known], np.nan_to_num(followed[known])
+            log_bands(recorder, path, t_ns, followed[:, :1], followed[:, 1:], ["offset"], "s")
             settled = followed[len(followed) // 10 :]  # the prior at the start would dwarf what is found
             low, high = (settled[:, 0] + times * settled[:, 1] for times in (-3.0, 3.0))
             recorder.widen(path, low, high)

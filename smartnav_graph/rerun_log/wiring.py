@@ -61,8 +61,11 @@ def log_graph(recorder: Recorder, trace: Trace) -> None:
         colors=np.array([color for picture in pictures for color in picture.colors], dtype=np.uint8),
     )
     edges = rr.GraphEdges.columns(edges=np.array([edge for picture in pictures for edge in picture.edges]))
-    recorder.rows("/graph", times, nodes.partition([len(picture.ids) for picture in pictures]))
-    recorder.rows("/graph", times, edges.partition([len(picture.edges) for picture in pictures]))
+    columns = [
+        *nodes.partition([len(picture.ids) for picture in pictures]),
+        *edges.partition([len(picture.edges) for picture in pictures]),
+    ]
+    recorder.rows("/graph", times, columns)
     recorder.bounds["/graph"] = np.stack([places.min(axis=0) - MARGIN, places.max(axis=0) + MARGIN])
     recorder.style("/graph", rr.GraphEdges.from_fields(graph_type="undirected"))
 
@@ -138,8 +141,8 @@ def _shared(state: State) -> bool:
     return STATES[state[0]].scope == "session"
 
 
-def _order(state: State) -> tuple[bool, int, int]:
-    return _shared(state), state[1], _rank(state[0])
+def _order(state: State) -> tuple[bool, int, int, str]:
+    return _shared(state), state[1], _rank(state[0]), state[0]
 
 
 def _rank(letter: str) -> int:

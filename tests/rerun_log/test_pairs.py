@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from recordings import T0, make_session, make_solution, stamps, write
@@ -131,3 +133,8 @@ def test_legend_says_what_the_colours_of_matches_mean(found):
     legend = found.rows("/legend", "TextDocument:text", static=True)[0][0]
     assert f"* [{PATH}](recording:/{PATH}): **lines** from where a point was" in legend
     assert "/pairs/matches" not in legend
+
+
+def test_static_data_of_no_entity_are_in_parts_whose_order_is_left_to_chance(found):
+    parts = Counter(str(chunk.entity_path) for chunk in found.chunks if chunk.is_static)
+    assert max(parts.values()) == 1

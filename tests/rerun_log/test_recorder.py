@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recordings import (
-    SUMMARY,
-    T0,
-    N,
-    make_session,
-    make_solution,
-    write,
-)
+from recordings import EVALUATION, SUMMARY, T0, N, make_session, make_solution, replayed, stamps, write
 
 from smartnav_graph.errors import SessionError
 from smartnav_graph.rerun_log import recorder, viewer, write_recording
+from smartnav_graph.solution import Residuals
 from smartnav_graph.timebase import NS
 
 
@@ -121,3 +116,37 @@ def test_importing_the_package_does_not_load_rerun():
 )
 def test_a_small_plot_has_two_numbers_at_its_axis(low, high, expected):
     assert recorder.readable(low, high) == pytest.approx(expected)
+
+
+def test_what_is_unknown_does_not_make_equal_recordings_differ(tmp_path):
+    """NaN is never equal to NaN: rows of unknown values are left out, residuals of fewer axes stand by themselves."""
+    whitened = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    ragged = Residuals(
+        t_ns=stamps([1.0, 1.0, 1.0, 2.0, 2.0]),
+        sensor=np.array(["pose"] * 5, dtype=object),
+        axis=np.array([0, 1, 2, 0, 1]),
+        whitened=whitened,
+        weight=np.ones(5),
+        used=np.ones(5, dtype=bool),
+    )
+    rotation = EVALUATION.rotation_error_deg.copy()
+    rotation[:5] = np.nan
+    followed = np.column_stack([np.linspace(0.0, 0.06, N), np.full(N, np.nan)])
+    followed[:3] = np.nan
+    changes = {
+        "solution": make_solution(residuals=ragged),
+        "evaluation": SimpleNamespace(**(vars(EVALUATION) | {"rotation_error_deg": rotation})),
+        "summary": {"states": {"gnss_time_offset_s": {"value": 0.06, "sigma": 0.01, "held": False}}},
+        "trace": replayed(states={"gnss_time_offset_s": followed}),
+        "causal": make_solution(),
+    }
+    found = write(tmp_path / "a.rrd", **changes)
+    write(tmp_path / "b.rrd", **changes)
+    command = [str(viewer.executable()), "rrd", "compare", str(tmp_path / "a.rrd"), str(tmp_path / "b.rrd")]
+    compared = subprocess.run(command, capture_output=True, text=True)
+    assert compared.returncode == 0, compared.stderr[:2000]
+    by_axis = [found.values(f"/residuals/pose/{k}", "Scalars:scalars")[:, 0].tolist() for k in range(3)]
+    assert by_axis == [[1.0, 4.0], [2.0, 5.0], [3.0]]
+    assert len(found.values("/error/rotation", "Scalars:scalars")) == N - 5
+    np.testing.assert_array_equal(found.values("/clock/gnss", "Measurements:values")[:, 0], followed[3:, 0])
+    np.testing.assert_array_equal(found.values("/clock/gnss", "Measurements:variances"), np.zeros((N - 3, 1)))

@@ -64,3 +64,10 @@ def test_each_moment_shows_the_last_keyframes(tmp_path, monkeypatch):
     assert found.index("/graph", "GraphNodes:node_ids", "keyframe").tolist() == [0, 1, 2]
     assert [len(row) for row in found.rows("/graph", "GraphEdges:edges")] == [3, 10, 12]
     assert "Factor graph" in found.view_names()
+
+
+def test_places_do_not_hang_on_the_order_of_a_set():
+    """States with the same index: the camera's clock and its attitude."""
+    factors = [("coplanarity", [("X", 0), ("T", 10), ("A", 10), ("L", 10)])]
+    labels = [label for label in wiring.picture_of(factors, first=0).labels if label != "coplanarity"]
+    assert labels == ["pose 0", "mount rotation", "lever arm", "time offset"]
