@@ -9,6 +9,7 @@ for _ in range(passes):                       # replay: one, causal
 from __future__ import annotations
 
 import gc
+import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ from smartnav_graph.outcome import Outcome
 from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.progress import Progress, silent, watched
-from smartnav_graph.revise import extra_passes, position_builders, revise
+from smartnav_graph.revise import extra_passes, position_builders, revise, widened
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
@@ -147,7 +148,10 @@ def solve_passes(
     most = problem.config.run.passes + extra_passes(problem.builders)
     precision = FIRST if unsure else problem.config.solve
     builders, first = [prior, *problem.builders], warm
-    for count in range(1, most + 1):
+    if memory.phase == "robust" and not unsure:
+        memory = widened(problem.builders, memory)
+    for count in itertools.count(1):
+        most += memory.narrowing
         stage = f"pass {count} of at most {most}"
         smoother = Batch(problem.config.batch, precision, warm, problem.session.t0_ns, unsure, first_s)
         one_pass(smoother, watched(stage, windows, progress), builders, memory, problem)
@@ -161,8 +165,8 @@ def solve_passes(
             return estimate, memory, count
         # Least squares bent by outliers is no start for a redescending loss: settled stretch by stretch it stays near
         # the truth, and a burst stands out against what is foretold.
-        cold = learnt.phase == "robust" and learnt.stage == 0 and not unsure
-        warm = first if cold else estimate.values
+        cold = memory.phase == "plain" and learnt.phase == "robust" and learnt.stage == 0 and not unsure
+        warm, learnt = (first, widened(problem.builders, learnt)) if cold else (estimate.values, learnt)
         if learnt.stage > memory.stage and lost(problem.builders, estimate):
             warm, learnt = _window_by_window(problem, windows, builders, learnt, progress)
         memory = learnt

@@ -303,7 +303,8 @@ class Memory:
     stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
     constraints, time offsets, magnetometer, steps)
     settled : passes that a builder has spent on judging what it is made of
-    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is
+    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is, and in
+    the robust phase the least sigma (m) that a fix has under the loss
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``graduated`` (truncated least
     squares by and by, where asked for), ``gated`` (least squares without outliers), ``causal`` (replay: least squares,
     a redescending loss where a fix contradicts the prediction)
@@ -322,6 +323,11 @@ class Memory:
     def weight(self, sensor: str, row: int) -> float:
         """Weight of a row while the loss is graduated, 1 otherwise."""
         return self.weights.get(sensor, {}).get(row, 1.0)
+
+    @property
+    def narrowing(self) -> bool:
+        """Whether a loss is still wider than the noise."""
+        return self.phase == "robust" and self.control > 0.0
 
     def scale(self, group: str) -> float:
         return self.noise_scales.get(group, 1.0)

@@ -1,7 +1,9 @@
 """What one pass teaches the next: which fixes to reject, and how noisy the sensors are.
 
 Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
-and rows inside the gate are let in again. Where asked for, truncated least squares by graduated non-convexity stands
+and rows inside the gate are let in again. A redescending loss does not see what lies far beyond its sigma, and the way
+to a fix of centimetres is foretold to metres: so the loss is as wide as that first, and narrowed pass by pass. Where
+asked for, truncated least squares by graduated non-convexity stands
 between the two, warm-started by the first. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
 with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6). What needs the
 trajectory found first (time offsets, vehicle constraints, wandering errors) joins when nothing is left to learn
@@ -44,6 +46,11 @@ STEADY_INERTIAL = 0.1
 # Growth of the control a pass from a warm start, and the most passes that takes.
 GROWTH = 4.0
 GRADUATED_PASSES = 14
+
+# Sigma (m) of fixes under a redescending loss, as far as a stretch between fixes is foretold, and the share of it that
+# the next pass has.
+WIDE_M = 3.0
+NARROWER = 0.1
 
 # A session state is held where the data leave more than this of its prior sigma.
 OBSERVED = 0.7
@@ -197,6 +204,8 @@ def _revised(
     judged = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
     if memory.phase == "plain" and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
         return replace(new, phase="robust"), False
+    if memory.narrowing:
+        return replace(new, control=_narrower(found, memory.control)), False
     outliers = {v.name: v.outside() for v in judged}
     if memory.phase in ("robust", "graduated"):
         weighed = _graduated(judged, memory)
@@ -213,6 +222,21 @@ def _revised(
         return new, False
     grown = _grown(builders, estimate, tuned)
     return grown, grown == tuned
+
+
+def widened(builders: Iterable[Builder], memory: Memory) -> Memory:
+    """The memory of a robust pass from a start that is no better than foretold."""
+    sigmas = [float(np.median(b.scaled_sigma(memory)[:, :2])) for b in position_builders(builders) if b.gated]
+    return replace(memory, control=WIDE_M if min(sigmas, default=WIDE_M) < WIDE_M / 3 else 0.0)
+
+
+def _narrower(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], control: float) -> float:
+    """The next least sigma (m) of fixes under the loss: a share of this one, less where most fixes agree better, none
+    once it would be below what is known of them."""
+    known = [(float(np.median(one.sigma[:, :2])), float(np.median(one.square))) for _, one in found.values()]
+    level = chi2(3).median()
+    wanted = min(NARROWER * control, 2.0 * max(sigma * np.sqrt(max(square / level, 1.0)) for sigma, square in known))
+    return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
 
 
 def _graduated(judged: Sequence[Verdict], memory: Memory) -> Memory | None:

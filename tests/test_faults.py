@@ -49,6 +49,16 @@ def assert_told_apart(drive, kind: str, seed: int, vehicle: str = "none", loss: 
     assert len(rejected) == run.summary["rejected"]["gnss"]
 
 
+@pytest.mark.parametrize(("kind", "seed"), [("isolated", 3), pytest.param("a fifth", 5, marks=pytest.mark.slow)])
+def test_among_fixes_of_centimetres_too(kitti, kind, seed):
+    """No loss as narrow as these fixes finds the way that inertial data foretell to metres."""
+    bad = degrade(kitti, Degrade(outliers=KINDS[kind]), seed)
+    mask = np.asarray(bad.gnss.extra["is_outlier"]) == 1
+    told = np.zeros(len(mask), dtype=bool)
+    told[[one["row"] for one in sn.run(bad).summary["rejections"]]] = True
+    assert (told | ~mask).all() and (told & ~mask).sum() <= 2
+
+
 def test_a_fifth_of_outliers_is_told_apart(kitti):
     assert_told_apart(kitti, "a fifth", 2)  # the first fix is one of them
 

@@ -258,6 +258,8 @@ class PositionBuilder:
         weight = memory.weight(self.name, row)
         used = not memory.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         loss = self._loss_of(row, sigma, step, memory) if index == step.index else self._loss_late(memory)
+        if memory.narrowing and loss == "cauchy":
+            sigma = np.maximum(sigma, memory.control)
         sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
         chain = self.name in memory.correlated
         if partial is None and not (states or chain):
