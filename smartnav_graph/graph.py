@@ -303,7 +303,7 @@ class Memory:
     stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
     constraints, time offsets, magnetometer, steps)
     settled : passes that a builder has spent on judging what it is made of
-    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is, and in
+    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is, or in
     the robust phase the least sigma (m) that a fix has under the loss
     phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``graduated`` (truncated least
     squares by and by, where asked for), ``gated`` (least squares without outliers), ``causal`` (replay: least squares,
