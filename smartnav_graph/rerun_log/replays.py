@@ -80,4 +80,4 @@ def log_latency(recorder: Recorder, updates: Updates) -> None:
     import rerun as rr
 
     recorder.rows("/update/latency", updates.t_ns, rr.Scalars.columns(scalars=updates.latency_ms))
-    recorder.style("/update/latency", rr.SeriesLines(colors=colours.COVARIANCE, names="latency ms"))
+    recorder.style("/update/latency", rr.SeriesLines(colors=colours.AXES[1], names="latency ms"))

@@ -21,9 +21,9 @@ _LEGEND = {
     "/world/est/velocity": "**light green arrow**, the path of one second at the velocity of the chosen time",
     "/world/est/covariance": "**orange, filled**, 3σ ellipsoid of the position at the chosen time, true size",
     "/world/est/covariances": "**orange, wire**, 3σ ellipsoids along the path, magnified as the view's name says",
-    "/world/causal/path": "**yellow line**, the estimate when each keyframe became known",
-    "/world/causal/now": "**yellow point**, the estimate that the chosen time had of itself",
-    "/world/causal/covariance": "**yellow, filled**, its 3σ ellipsoid, true size",
+    "/world/causal/path": "**gold line**, the estimate when each keyframe became known",
+    "/world/causal/now": "**gold point**, the estimate that the chosen time had of itself",
+    "/world/causal/covariance": "**gold, filled**, its 3σ ellipsoid, true size",
     "/world/causal/window": "**magenta line**, the window: what the update of the chosen time could still correct, "
     "as it left it",
     "/world/reference/path": "**thin grey line**, the reference",
