@@ -20,6 +20,7 @@ import smartnav_graph as sn
 from smartnav_graph import estimate
 from smartnav_graph.graph import KEYFRAME_LETTERS, key
 from smartnav_graph.problem import prepare
+from smartnav_graph.progress import silent
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.minimise import SolveConfig, minimise
@@ -39,7 +40,7 @@ def solve(folder: str) -> dict[str, float]:
     problem = prepare(sn.load(folder), config)
     initial = estimate.initialise(problem)
     builders = [initial.prior, *problem.builders]
-    start, memory = estimate._window_by_window(problem, problem.windows, builders, initial.memory)
+    start, memory = estimate._window_by_window(problem, problem.windows, builders, initial.memory, silent)
     found, _, _ = estimate.solve_passes(problem, problem.windows, initial.prior, memory, warm=start)
     graph, held = gtsam.NonlinearFactorGraph(), {}
     for _, factor in found.factors:
@@ -51,7 +52,7 @@ def solve(folder: str) -> dict[str, float]:
             pairs += 1
     values = gtsam.Values(start)
     for builder in problem.builders:
-        for state in builder._states() if builder.name == "coplanarity" else ():
+        for state in builder.eye.states().values() if builder.name == "coplanarity" else ():
             graph.push_back(session_prior(state))
             values.insert(state.key, state.initial)
     ours = vectorised(found, values)

@@ -299,10 +299,13 @@ def _inertial(
 ) -> tuple[Memory, bool]:
     """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
     residuals hold more than noise: what they say is an upper bound. Beside fixes that wander it is a lower one: the
-    solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part."""
+    solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part.
+    Beside images too: under their redescending loss it keeps to them less than their sigma says."""
     scales = noise_scales(builders, windows, estimate, memory, level)
     if any(builder.wanders(memory) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
+    if memory.settled:
+        scales = {name: max(scale, memory.scale(name)) for name, scale in scales.items()}
     if memory.stage < LAST_STAGE:
         scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}
         return replace(new, noise_scales={**new.noise_scales, **scales}), True

@@ -28,7 +28,7 @@ class SolveConfig:
     the next would be of 1e-6."""
 
     max_iterations: int = 50
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     step_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
