@@ -32,7 +32,7 @@ from smartnav_graph.outcome import Outcome
 from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
 from smartnav_graph.progress import Progress, silent, watched
-from smartnav_graph.revise import extra_passes, position_builders, revise, widened
+from smartnav_graph.revise import BENT_M, WIDE_M, extra_passes, position_builders, revise, widened
 from smartnav_graph.session import Session
 from smartnav_graph.smoothers import Smoother, incremental
 from smartnav_graph.smoothers.batch import Batch
@@ -147,7 +147,7 @@ def solve_passes(
     """
     most = problem.config.run.passes + extra_passes(problem.builders)
     precision = FIRST if unsure else problem.config.solve
-    builders, first = [prior, *problem.builders], warm
+    builders, first, astray = [prior, *problem.builders], warm, False
     if memory.phase == "robust" and not unsure:
         memory = widened(problem.builders, memory)
     for count in itertools.count(1):
@@ -163,10 +163,15 @@ def solve_passes(
         learnt, done = revise(problem.builders, windows, estimate, memory)
         if done or count == most or (unsure and learnt.stage > memory.stage):
             return estimate, memory, count
-        # Least squares bent by outliers is no start for a redescending loss: settled stretch by stretch it stays near
-        # the truth, and a burst stands out against what is foretold.
-        cold = memory.phase == "plain" and learnt.phase == "robust" and learnt.stage == 0 and not unsure
-        warm, learnt = (first, widened(problem.builders, learnt)) if cold else (estimate.values, learnt)
+        # Least squares bent by outliers is a poor start for a redescending loss: settled stretch by stretch it stays
+        # near the truth, and a burst stands out against what is foretold. Where it loses its way, least squares it is.
+        if memory.phase == "robust" and not (estimate.converged or unsure or astray):
+            memory = replace(memory, phase="plain", control=0.0, rejected={})
+            warm, astray, most = first, True, most + 2
+            continue
+        warm = estimate.values
+        if memory.phase == "plain" and learnt.phase == "robust" and learnt.stage == 0 and not unsure:
+            warm, learnt = (warm if astray else first), widened(problem.builders, learnt, BENT_M if astray else WIDE_M)
         if learnt.stage > memory.stage and lost(problem.builders, estimate):
             warm, learnt = _window_by_window(problem, windows, builders, learnt, progress)
         memory = learnt

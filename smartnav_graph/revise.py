@@ -47,9 +47,9 @@ STEADY_INERTIAL = 0.1
 GROWTH = 4.0
 GRADUATED_PASSES = 14
 
-# Sigma (m) of fixes under a redescending loss, as far as a stretch between fixes is foretold, and the share of it that
-# the next pass has.
-WIDE_M = 3.0
+# Sigma (m) of fixes under a redescending loss: as far as a stretch between fixes is foretold, and as far as outliers
+# bend least squares; and the share of it that the next pass has.
+WIDE_M, BENT_M = 3.0, 30.0
 NARROWER = 0.1
 
 # A session state is held where the data leave more than this of its prior sigma.
@@ -224,10 +224,10 @@ def _revised(
     return grown, grown == tuned
 
 
-def widened(builders: Iterable[Builder], memory: Memory) -> Memory:
-    """The memory of a robust pass from a start that is no better than foretold."""
+def widened(builders: Iterable[Builder], memory: Memory, metres: float = WIDE_M) -> Memory:
+    """The memory of a robust pass from a start that is off by so many metres."""
     sigmas = [float(np.median(b.scaled_sigma(memory)[:, :2])) for b in position_builders(builders) if b.gated]
-    return replace(memory, control=WIDE_M if min(sigmas, default=WIDE_M) < WIDE_M / 3 else 0.0)
+    return replace(memory, control=metres if min(sigmas, default=metres) < metres / 3 else 0.0)
 
 
 def _narrower(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], control: float) -> float:

@@ -76,6 +76,15 @@ def test_a_turned_world_is_the_same_world(eight):
     assert turned.sigmas[:, [3, 4]] == pytest.approx(base.sigmas[:, [4, 3]], rel=1e-3)
 
 
+def test_a_loss_that_loses_its_way_begins_again_from_least_squares():
+    """A good fix looks wrong in the first minute; among outliers looked for stretch by stretch, the drive is lost."""
+    session = sn.simulate("phone-car-5min", 26)
+    run = sn.run(session)
+    assert run.summary["converged"] and not run.summary["rejected"]
+    at = np.searchsorted(session.reference.t_ns, run.solution.t_ns[[100, 200]])
+    assert np.linalg.norm(run.solution.nav_t_body[[100, 200]] - session.reference.enu[at], axis=1).max() < 15.0
+
+
 @pytest.mark.parametrize("kind", [pytest.param("isolated", marks=pytest.mark.slow), "burst"])
 def test_outliers_end_at_the_solution_without_them(kind):
     """5 % of the fixes off by 50 to 200 m: least squares over the rest, as if they had not been there."""
