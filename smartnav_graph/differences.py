@@ -13,6 +13,10 @@ from smartnav_graph.run_folder import StoredRun, config_differences
 # Rows of one sensor that only one run rejected, told one by one.
 FEW = 8
 COLUMNS = ("RMS", "median", "95 %", "largest", "at s", "in sigmas", "sigma 2/1")
+MEANING = (
+    "in sigmas: the largest difference over the larger sigma of the two runs; "
+    "sigma 2/1: median sigma of the second run over that of the first"
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class RunDifferences:
     def to_markdown(self) -> str:
         """The same as a document."""
         names, rows = COLUMNS, [self._row(measure) for measure in MEASURES]
-        tables = [_markdown(("", *names), rows)]
+        tables = [_markdown(("", *names), rows), MEANING]
         for name in ("config", "figures"):
             told = [(key, _told(one), _told(other)) for key, (one, other) in getattr(self, name).items()]
             tables += [_markdown((name, self.first.path.name, self.second.path.name), told)] if told else []
@@ -72,6 +76,7 @@ class RunDifferences:
         for measure in MEASURES:
             name, *told = self._row(measure)
             yield f"{name:<16}{''.join(f'{text:>11}' for text in told)}"
+        yield MEANING
 
     def _row(self, measure: Measure) -> tuple[str, ...]:
         one = self.states.apart(measure)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.differences import compare_runs
+from smartnav_graph.differences import MEANING, compare_runs
 from smartnav_graph.evaluation.compare import MEASURES
 from smartnav_graph.run_folder import plain, read_run, write_run
 
@@ -29,6 +29,7 @@ def test_text_says_where_how_far_and_what_was_asked(runs):
     assert "figures  withheld.gnss: - | " in text
     (line,) = [line for line in text.splitlines() if line.startswith("horizontal m")]
     largest = found.states.apart(MEASURES[1])
+    assert MEANING in text.splitlines()
     assert line.split()[5:7] == [f"{largest.statistics.max:.4g}", f"{largest.largest_at_s:.2f}"]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.report import charts, constants, facts, replays, statistics, timeline, track, usage
-from smartnav_graph.report.text import as_float, attributes, capital, fixed, metres, plural
+from smartnav_graph.report.text import as_float, attributes, fixed, metres, plural
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Solution
 from smartnav_graph.trace import Updates
@@ -276,7 +276,8 @@ def timing_bars(timings: Mapping[str, float]) -> str:
     """Seconds of every step as a bar beside its number."""
     most = max((v for v in timings.values()), default=0.0)
     rows = "".join(
-        f'<tr><th scope="row">{escape(capital(name))}</th><td class="n">{fixed(value, 3)} s</td><td class="wide">'
+        f'<tr><th scope="row">{escape(facts.step_name(name, timings))}</th>'
+        f'<td class="n">{fixed(value, 3)} s</td><td class="wide">'
         f'<svg class="meter" viewBox="0 0 1000 10" preserveAspectRatio="none" aria-hidden="true">'
         f'<rect class="{"total" if name == "total" else "part"}" width="{1000 * value / most if most else 0:.0f}" '
         f'height="10"/></svg></td></tr>'

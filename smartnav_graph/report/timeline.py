@@ -40,9 +40,10 @@ def lanes(solution: Solution, summary: Summary, gaps: Intervals, withheld: Mappi
     none = np.zeros(0)
     found = []
     for name in (*POSITIONS, *IMAGES):
-        used, out = _times(solution, name, True), _times(solution, name, False)
+        used, out = _times(solution, name, True), _rejected(solution, summary, name)
         if len(used) or len(out):
-            rejected = f", {count(len(out))} rejected" if len(out) else ""
+            number = int(room(summary, "rejected").get(name) or len(out))
+            rejected = f", {count(number)} rejected" if number else ""
             found.append(Lane(f"{sensor_name(name)} in use{rejected}", stretches(used), "used", out))
     for name, rows in withheld.items():
         t = np.unique((np.asarray(rows.t_ns) - solution.t0_ns) / 1e9)
@@ -53,6 +54,12 @@ def lanes(solution: Solution, summary: Summary, gaps: Intervals, withheld: Mappi
     if gaps:
         found.append(Lane("IMU holes", gaps, "hole", none))
     return found
+
+
+def _rejected(solution: Solution, summary: Summary, sensor: str) -> Floats:
+    """Times s of what was rejected, as the run told it: an image pair may end where another one is in use."""
+    told = [float(one["t_s"]) for one in summary.get("rejections") or () if one["sensor"] == sensor]
+    return np.unique(told) if told else _times(solution, sensor, False)
 
 
 def _times(solution: Solution, sensor: str, used: bool) -> Floats:

@@ -43,7 +43,7 @@ _FOUND: Names = (
     ("Gyroscope bias rad/s, bands 1σ 3σ", "/bias/gyro"),
 )
 _UPDATES: Names = (
-    ("Updates: latency ms, states", "/update/effort"),
+    ("Updates: states (latency ms in latency.rrd)", "/update/effort"),
     ("Correction of the past m", "/update/correction"),
     ("Rejected rows by update", "/update/rejected"),
 )

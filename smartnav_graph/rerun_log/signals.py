@@ -151,7 +151,7 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
         # crosses, small ones where there are so many that they would cover all else
         cross = "cross", (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
         red = [colours.REJECTED] * width
-        _log_axes(recorder, f"{path}/rejected", *rejected, ["rejected"] * width, red, cross)
+        _log_axes(recorder, f"{path}/rejected", *rejected, ["rejected ×"] * width, red, cross)
         if len(rejected[0]):
             limit = _limit(np.abs(used[1]), np.abs(rejected[1]))
             recorder.limits[path] = readable(-limit, limit)

@@ -91,10 +91,13 @@ def ellipsoids(covariance: Floats) -> tuple[Floats, Floats]:
 def magnification(covariance: Floats, size: float) -> float:
     """How many times larger the ellipsoids along the path are drawn, a round number.
 
-    The 90 % quantile of their size reaches 1 % of the extent, unless the largest would then exceed 5 %.
+    The 90 % quantile of their size reaches 1 % of the extent, unless the largest would then exceed 5 %. Ellipsoids
+    that are that large anyway keep their true size; they shrink only where the largest would exceed 15 %.
     """
     spread = ELLIPSOID_SIGMAS * np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    return nice(min(0.01 * size / float(np.percentile(spread, 90)), 0.05 * size / float(spread.max())))
+    largest = float(spread.max()) / size
+    factor = min(0.01 * size / float(np.percentile(spread, 90)), 0.05 / largest)
+    return 1.0 if factor < 1.0 and largest <= 0.15 else nice(factor)
 
 
 def thinned(points: Floats, most: int = MOST_PATH_POINTS) -> Floats:

@@ -33,6 +33,8 @@ _LEGEND = {
     "/world/rejected": "**red points**, rejected positions of other kinds",
     "/world/pose_fixes": "**cyan points**, position fixes from elsewhere",
     "/world/control": "**pink points**, surveyed points",
+    "/error/position": "**bands**, one and three sigma of the run. Where the run was aligned to the reference first, "
+    "errors are not nil at the start, while the sigmas may be",
 }
 
 _IMAGE_LEGEND = {

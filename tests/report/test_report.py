@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph.errors import SessionError
 from smartnav_graph.report import facts, report_markdown, write_report
 from smartnav_graph.report.statistics import accelerations
+from smartnav_graph.report.timeline import lanes
 from smartnav_graph.session import Session
 from smartnav_graph.solution import Residuals, Solution
 from smartnav_graph.streams import Imu
@@ -266,6 +267,20 @@ def test_timeline_has_a_lane_for_what_there_was(dom, case) -> None:
     starts = [float(re.match(r"M(\d+)", p.get("d"))[1]) / 10_000 * 469 for p in holes]
     assert starts == pytest.approx([h[0] for h in HOLES], abs=0.05)  # s, half a drawing unit
     assert len([p for p in lanes if "out" in p.get("class")]) == len(REJECTED)
+
+
+def test_a_rejection_beside_what_is_in_use_stands_on_the_timeline(case) -> None:
+    told = [{"t_s": 7.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}]
+    assert 8 not in REJECTED  # something of that instant is in use
+    (lane, *_) = lanes(case.solution, summary() | {"rejections": told, "rejected": {"gnss": 3}}, [], {})
+    assert lane.name == "GNSS in use, 3 rejected"
+    np.testing.assert_array_equal(lane.out, [7.0, 8.0])
+
+
+def test_the_total_of_a_report_says_that_writing_is_not_in_it() -> None:
+    known = {"solve": 1.0, "total": 1.2}
+    assert [facts.step_name(name, known) for name in known] == ["Solve", "Total, without writing"]
+    assert facts.step_name("total", known | {"write": 0.5}) == "Total"
 
 
 def test_too_many_rejections_are_a_warning(tmp_path, case) -> None:

@@ -45,9 +45,11 @@ def test_updates_tell_effort_correction_and_doubts(found):
     np.testing.assert_array_equal(effort, np.column_stack([np.arange(N), 2 * np.arange(N)]))
     np.testing.assert_array_equal(found.values("/update/correction", "Scalars:scalars")[:, 0], updates().corrected)
     assert found.index("/update/rejected", "Scalars:scalars", "keyframe").tolist() == [0, 10, 20, 30]
-    assert {"Updates: latency ms, states", "Correction of the past m", "Rejected rows by update"} <= set(
-        found.view_names()
-    )
+    assert {
+        "Updates: states (latency ms in latency.rrd)",
+        "Correction of the past m",
+        "Rejected rows by update",
+    } <= set(found.view_names())
 
 
 def test_a_long_window_is_thinned_to_its_ends():

@@ -65,6 +65,12 @@ def test_one_long_outage_does_not_bury_the_path_under_ellipsoids():
     assert spatial.magnification(covariance[:95], 1000.0) == 10.0
 
 
+def test_ellipsoids_that_show_at_their_true_size_are_never_shrunk():
+    covariance = np.eye(3) * np.linspace(0.1, 0.6, 50)[:, None, None] ** 2  # 3 sigma of up to 3.1 m in all
+    assert spatial.magnification(covariance, 35.0) == 1.0
+    assert spatial.magnification(covariance, 10.0) < 1.0  # they would hide the path
+
+
 def test_rejected_fixes_and_residuals_are_apart(recording):
     session = make_session()
     enu = session.nav_position(session.gnss)
