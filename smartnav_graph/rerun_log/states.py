@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from smartnav_graph.report.constants import constants
 from smartnav_graph.rerun_log import colours
 from smartnav_graph.rerun_log.recorder import Recorder
 from smartnav_graph.rerun_log.signals import log_bands
@@ -48,17 +49,6 @@ def clocks(states: Mapping[str, Any]) -> list[str]:
 
 
 def table(states: Mapping[str, Any]) -> str:
-    """The states of a summary as a Markdown table."""
-    rows = ["# States of the session", "", "| state | value | 1σ | |", "|---|---|---|---|"]
-    for name, state in states.items():
-        note = "held" if state.get("held") else ""
-        if "observed" in state:
-            note = "observed: " + ", ".join("yes" if seen else "no" for seen in state["observed"])
-        rows.append(f"| {name} | {_numbers(state['value'])} | {_numbers(state['sigma'])} | {note} |")
-    return "\n".join(rows) + "\n"
-
-
-def _numbers(value: Any) -> str:
-    if value is None:
-        return ""
-    return ", ".join(f"{x:.5g}" for x in (value if isinstance(value, list | tuple) else [value]))
+    """The states of a summary as Markdown tables, in the words and units of the report."""
+    tables = [found.markdown() for _, found in constants({"states": states})]
+    return "\n\n".join(["# States of the session", *tables]) + "\n"

@@ -36,9 +36,10 @@ def test_in_a_replay_it_is_drawn_as_each_update_has_it(tmp_path):
 def test_every_state_stands_in_the_table(tmp_path):
     found = write(tmp_path / "run.rrd", summary={"states": FOUND})
     text = found.rows("/states", "TextDocument:text", static=True)[0][0]
-    assert "| gnss_time_offset_s | 0.06 | 0.002 |  |" in text
-    assert "| gnss_lever_arm_correction_m | 0.1, 0.2, 0.3 | 0.01, 0.01, 0.01 | observed: yes, yes, no |" in text
-    assert "| accel_noise_density | 0.003 |  | held |" in text
+    assert "| GNSS time offset [s] | 0.0600 | 0.00200 | estimated |" in text
+    (unseen,) = [line for line in text.splitlines() if line.endswith("| 0.300 | 0.0100 | rests on its prior |")]
+    assert unseen.startswith("| GNSS lever arm") and "[m]" in unseen
+    assert "| Accelerometer noise density [m/s²/√Hz] | 0.00300 | – | as given |" in text
     assert "States of the session" in found.view_names()
 
 
