@@ -176,7 +176,7 @@ def _known(covariance: Floats) -> NDArray[np.bool_]:
 
 def log_solution(scene: Scene, solution: Solution) -> float:
     """Path, moving body with axes and velocity, covariance ellipsoids; the magnification of those along the path."""
-    scene.path("est", solution.nav_t_body, colours.ESTIMATE, 2.5)
+    scene.path("est", solution.nav_t_body, colours.ESTIMATE, 1.5)
     good = np.isfinite(solution.nav_t_body).all(axis=1) & np.isfinite(solution.nav_R_body).all(axis=(1, 2))
     rows = np.flatnonzero(good)
     if not len(rows):
@@ -238,8 +238,8 @@ def log_fixes(scene: Scene, events: Events) -> None:
     if session.gnss is not None:
         enu = session.nav_position(session.gnss)
         for name, use, colour, size in (
-            ("fixes", USED, colours.FIX, 1.7),
-            ("withheld", WITHHELD, colours.WITHHELD, 2.0),
+            ("fixes", USED, colours.FIX, 2.2),
+            ("withheld", WITHHELD, colours.WITHHELD, 2.2),
             ("rejected", REJECTED, colours.REJECTED, 4.5),
         ):
             scene.points(f"gnss/{name}", enu[events.use["gnss"] == use], colour, size)
