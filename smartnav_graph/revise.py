@@ -23,6 +23,7 @@ from scipy.stats import chi2
 from smartnav_graph import graduated
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import skew, turned
+from smartnav_graph.factors.vehicle import VehicleBuilder
 from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
 from smartnav_graph.pair_gate import settled
 from smartnav_graph.row_noise import row_scales
@@ -300,11 +301,11 @@ def _inertial(
     """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
     residuals hold more than noise: what they say is an upper bound. Beside fixes that wander it is a lower one: the
     solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part.
-    Beside images too: under their redescending loss it keeps to them less than their sigma says."""
+    Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
     scales = noise_scales(builders, windows, estimate, memory, level)
     if any(builder.wanders(memory) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
-    if memory.settled:
+    if memory.settled or any(isinstance(builder, VehicleBuilder) for builder in builders):
         scales = {name: max(scale, memory.scale(name)) for name, scale in scales.items()}
     if memory.stage < LAST_STAGE:
         scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}

@@ -56,7 +56,7 @@ def test_covariances_are_honest_over_thirty_runs():
 def test_a_gyro_that_drifts_more_than_told_is_caught():
     def bold(seed: int) -> sn.Session:
         session = alone(seed)
-        noise = replace(session.calibration.imu_noise, gyro_bias_walk=2e-5)
+        noise = replace(session.calibration.imu_noise, gyro_bias_walk=2e-6)
         return session.replace(calibration=replace(session.calibration, imu_noise=noise))
 
     bad = outside(average_nees(bold, 8), 8)
