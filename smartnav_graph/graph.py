@@ -73,6 +73,20 @@ def kind_of(name: int) -> StateKind:
     return STATES[chr(gtsam.symbolChr(name))]
 
 
+# A GTSAM key holds its letter in the highest byte, its index below.
+_LETTER_AT = np.uint64(56)
+
+
+def letters_of(names: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Letter of each key, as its character's number."""
+    return (names >> _LETTER_AT).astype(np.uint8)
+
+
+def indices_of(names: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Index of each key."""
+    return (names & ((np.uint64(1) << _LETTER_AT) - np.uint64(1))).astype(np.int64)
+
+
 @lru_cache(maxsize=1 << 18)
 def key(letter: str, index: int) -> int:
     """GTSAM key of a state."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
-from smartnav_graph.graph import Memory, Step
+from smartnav_graph.graph import Memory, Step, indices_of, letters_of
 from smartnav_graph.problem import Problem
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.incremental import Incremental
@@ -20,9 +20,6 @@ from smartnav_graph.vision.pairs import Pairs
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Texts = NDArray[np.str_]
-
-# The lower bits of a GTSAM key are the index, the highest eight the letter.
-INDEX_BITS = 56
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,8 @@ class Wiring:
         return cls(
             sensor=np.array([sensor for sensor, _ in found], dtype=np.str_),
             factor=np.repeat(np.arange(len(found)), [len(names) for _, names in found]),
-            letter=(keys >> np.uint64(INDEX_BITS)).astype(np.uint8).view("S1").astype(np.str_),
-            index=(keys & np.uint64((1 << INDEX_BITS) - 1)).astype(np.int64),
+            letter=letters_of(keys).view("S1").astype(np.str_),
+            index=indices_of(keys),
         )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.factors import BUILDERS
-from smartnav_graph.graph import STATES, Tag, Window
+from smartnav_graph.graph import STATES, Tag, Window, letters_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.whole_graph import Stack
 
@@ -29,8 +29,6 @@ FACTORS, KEYFRAMES = "influence.parquet", "keyframes.parquet"
 CALIBRATION = "calibration"
 # Tags that do not begin with the name of their builder.
 _OF_OTHERS = {"rest": "prior", "pace": "gravity"}
-# A GTSAM key holds its letter in the highest byte, its index below.
-LETTER_AT = 56
 
 
 class Group(NamedTuple):
@@ -123,16 +121,6 @@ def builder_of(tag: str) -> str:
     return tag if tag in BUILDERS else _OF_OTHERS.get(tag, tag.split("_")[0])
 
 
-def letters(names: Names) -> NDArray[np.uint8]:
-    """Letter of each key, as its character's number."""
-    return (names >> np.uint64(LETTER_AT)).astype(np.uint8)
-
-
-def indices(names: Names) -> NDArray[np.int64]:
-    """Index of each key."""
-    return (names & np.uint64((1 << LETTER_AT) - 1)).astype(np.int64)
-
-
 def _native(estimate: Estimate) -> Iterator[Group]:
     """Native factors, linearised in one call, grouped by sensor and shape."""
     graph = gtsam.NonlinearFactorGraph()
@@ -145,7 +133,7 @@ def _native(estimate: Estimate) -> Iterator[Group]:
         if factor is None:  # a factor that says nothing at these values
             continue
         keys, augmented = factor.keys(), factor.augmentedJacobian()
-        shape = (tag.sensor, tuple(name >> LETTER_AT for name in keys), augmented.shape)
+        shape = (tag.sensor, letters_of(np.array(keys, dtype=np.uint64)).tobytes(), augmented.shape)
         found.setdefault(shape, []).append((tag, keys, augmented))
     for (sensor, *_), items in found.items():
         tags = [tag for tag, _, _ in items]
@@ -193,7 +181,7 @@ def _grouped(table: pa.Table) -> Iterator[Group]:
     keys, values = (_rows_of(table.column(name)) for name in ("keys", "values"))
     found: dict[tuple[Any, ...], list[int]] = {}
     for i, (names, numbers) in enumerate(zip(keys, values, strict=True)):
-        found.setdefault((sensor[i], letters(names).tobytes(), len(numbers)), []).append(i)
+        found.setdefault((sensor[i], letters_of(names).tobytes(), len(numbers)), []).append(i)
     for (name, kinds, _), rows in found.items():
         width = sum(STATES[chr(kind)].dim for kind in kinds) + 1
         augmented = np.array([values[i] for i in rows]).reshape(len(rows), -1, width)

@@ -13,8 +13,8 @@ from scipy.sparse import csr_matrix, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, STATES
-from smartnav_graph.influence.factors import Influence, builder_of, indices, letters
+from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, indices_of, letters_of
+from smartnav_graph.influence.factors import Influence, builder_of
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -159,7 +159,7 @@ class System:
 
     def _columns_of(self, names: NDArray[np.uint64]) -> NDArray[np.int64]:
         """Columns (g, width) of the states of alike factors, keys (g, k)."""
-        sizes = [STATES[chr(letter)].dim for letter in letters(names[0])]
+        sizes = [STATES[chr(letter)].dim for letter in letters_of(names[0])]
         first = np.array([self._first[name] for name in names.ravel().tolist()]).reshape(names.shape)
         return np.concatenate([first[:, [i]] + np.arange(size) for i, size in enumerate(sizes)], axis=1)
 
@@ -172,9 +172,9 @@ class System:
         """Which factors (f,) touch a keyframe, and which of them no other."""
         touches, alone = [], []
         for group in self.groups:
-            kind = letters(group.keys)
+            kind = letters_of(group.keys)
             shared = np.isin(kind, [ord(letter) for letter, state in STATES.items() if state.scope == "session"])
-            here = ~shared & (indices(group.keys) == index)
+            here = ~shared & (indices_of(group.keys) == index)
             touches.append((here & np.isin(kind, [ord(letter) for letter in KEYFRAME_LETTERS])).any(axis=1))
             alone.append((here | shared).all(axis=1))
         touched = np.concatenate(touches)
@@ -193,7 +193,7 @@ class System:
 
 def _first_columns(names: NDArray[np.uint64]) -> dict[int, int]:
     """First column of each state, keyframes in time order and then what they share; the number of columns at -1."""
-    kind, index = letters(names), indices(names)
+    kind, index = letters_of(names), indices_of(names)
     shared = np.array([STATES[chr(letter)].scope == "session" for letter in kind])
     order = np.lexsort((kind, index, shared))
     starts = np.concatenate([[0], np.cumsum([STATES[chr(letter)].dim for letter in kind[order]])])
