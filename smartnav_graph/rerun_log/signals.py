@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +114,19 @@ def _log_error(recorder: Recorder, evaluation: Any) -> None:
         _log_lines(recorder, "/error/rotation", t[known], np.asarray(rotation)[known, None], ["rotation"])
 
 
+class Marks(NamedTuple):
+    """How the points of each axis are drawn: names and colours of the axes, shape and size of all."""
+
+    names: list[str]
+    colors: list[list[int]]
+    shape: str
+    size: float
+
+    def of(self, axis: int) -> Marks:
+        """Those of one axis."""
+        return self._replace(names=self.names[axis : axis + 1], colors=self.colors[axis : axis + 1])
+
+
 def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:
     """Times (n,) and whitened residuals (n, axes) of one sensor; NaN where an axis has none.
 
@@ -147,11 +160,11 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
         used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
         width = used[1].shape[1]
         names = [axis_name(k, width) for k in range(width)]
-        _log_axes(recorder, path, *used, names, colours.of_axes(width), ("circle", MARKER_SIZE))
+        _log_axes(recorder, path, *used, Marks(names, colours.of_axes(width), "circle", MARKER_SIZE))
         # crosses, small ones where there are so many that they would cover all else
-        cross = "cross", (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
-        red = [colours.REJECTED] * width
-        _log_axes(recorder, f"{path}/rejected", *rejected, ["rejected ×"] * width, red, cross)
+        size = (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
+        crosses = Marks(["rejected ×"] * width, [colours.REJECTED] * width, "cross", size)
+        _log_axes(recorder, f"{path}/rejected", *rejected, crosses)
         if len(rejected[0]):
             limit = _limit(np.abs(used[1]), np.abs(rejected[1]))
             recorder.limits[path] = readable(-limit, limit)
@@ -168,37 +181,25 @@ def _log_axes(
     path: str,
     t_ns: NDArray[np.int64],
     values: Floats,
-    names: list[str],
-    colors: list[list[int]],
-    marker: tuple[str, float],
+    marks: Marks,
 ) -> None:
     """Points of all axes in one entity, or each in its own where rows have not the same axes: two recordings with NaN
     in them never compare equal."""
     there = np.isfinite(values)
     if there.all():
-        _log_points(recorder, path, t_ns, values, names, colors, marker)
+        _log_points(recorder, path, t_ns, values, marks)
         return
     for k, mask in enumerate(there.T):
-        rows = t_ns[mask], values[mask, k : k + 1]
-        _log_points(recorder, f"{path}/{k}", *rows, names[k : k + 1], colors[k : k + 1], marker)
+        _log_points(recorder, f"{path}/{k}", t_ns[mask], values[mask, k : k + 1], marks.of(k))
 
 
-def _log_points(
-    recorder: Recorder,
-    path: str,
-    t_ns: NDArray[np.int64],
-    values: Floats,
-    names: list[str],
-    colors: list[list[int]],
-    marker: tuple[str, float],
-) -> None:
+def _log_points(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, marks: Marks) -> None:
     import rerun as rr
 
-    shape, size = marker
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
     if len(t_ns):
-        count = len(names)
-        style = rr.SeriesPoints(colors=colors, names=names, markers=[shape] * count, marker_sizes=[size] * count)
+        shapes, sizes = [marks.shape] * len(marks.names), [marks.size] * len(marks.names)
+        style = rr.SeriesPoints(colors=marks.colors, names=marks.names, markers=shapes, marker_sizes=sizes)
         recorder.style(path, style)
 
 
