@@ -27,7 +27,7 @@ from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.first_state import initialiser_of
-from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step
+from smartnav_graph.graph import LAST_STAGE, Builder, Memory, State, Window, build_step, one_of
 from smartnav_graph.outcome import Outcome
 from smartnav_graph.pair_gate import lost, settled
 from smartnav_graph.problem import TOO_LATE, Problem, prepare, recut
@@ -105,7 +105,7 @@ def one_pass(
 
 def _settled_pairs(smoother: Batch, builders: Sequence[Builder], memory: Memory) -> Memory:
     """Judge image pairs again and again at what they lead to, all else as it is; the memory with what was found."""
-    pairs = next((b for b in builders if isinstance(b, CoplanarityBuilder)), None)
+    pairs = one_of(builders, CoplanarityBuilder)
     while pairs is not None and 0 < memory.settled.get(pairs.name, 0) < COMPRESSED:
         memory = settled(builders, smoother.provisional(), memory)
         smoother.renewed(partial(pairs.renew, memory=memory))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import gtsam
 import numpy as np
@@ -366,6 +366,14 @@ class Builder(Protocol):
     def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
         """Add this sensor's factors for `window`; `previous` is the latest state (None at the first keyframe)."""
         ...
+
+
+Kind = TypeVar("Kind")
+
+
+def one_of(builders: Iterable[Builder], kind: type[Kind]) -> Kind | None:
+    """The builder of a kind, where there is one."""
+    return next((builder for builder in builders if isinstance(builder, kind)), None)
 
 
 def build_step(

@@ -24,7 +24,7 @@ from smartnav_graph.factors.coplanarity import (
     REASONS,
     CoplanarityBuilder,
 )
-from smartnav_graph.graph import Builder, Memory
+from smartnav_graph.graph import Builder, Memory, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.gating import Geometry
@@ -44,15 +44,16 @@ SCALES = (0.3, 3.0)
 
 def settled(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> Memory:
     """The memory with the matches that agree with an estimate; unchanged once they are settled."""
-    for builder in builders:
-        if isinstance(builder, CoplanarityBuilder) and memory.settled.get(builder.name, 0) < COMPRESSED:
-            memory = _judged(builder, estimate, memory)
-    return memory
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None or memory.settled.get(builder.name, 0) >= COMPRESSED:
+        return memory
+    return _judged(builder, estimate, memory)
 
 
 def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> Memory:
     passed, scale = memory.settled.get(builder.name, 0), memory.scale(builder.name)
-    R, _, v, bias = (x[_keyframes(builder, estimate)[0]] for x in estimate.states())
+    place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
+    R, _, v, bias = (x[place] for x in estimate.states())
     builder.look(estimate.offset_s(STREAM), Motion(R, v, bias[:, 3:]))
     there, inside = relative_poses(builder, estimate)
     if passed == 0:
@@ -79,16 +80,16 @@ def _judged(builder: CoplanarityBuilder, estimate: Estimate, memory: Memory) -> 
 def lost(builders: Iterable[Builder], estimate: Estimate) -> bool:
     """Whether the way between images is so poorly known that what they say of it may be far: a redescending loss does
     not find the way back, and a baseline fits as well the other way round."""
-    for builder in builders:
-        if isinstance(builder, CoplanarityBuilder):
-            there, inside = relative_poses(builder, estimate)
-            sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
-            place, _ = _keyframes(builder, estimate)
-            strays = sigma[place][builder.pairs.images[:, 1]] * builder.pairs.length_s
-            astray = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
-            used = inside & (builder.verdict == IN_USE)
-            return bool(used.any() and astray[used].mean() > FEW_ASTRAY)
-    return False
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None:
+        return False
+    there, inside = relative_poses(builder, estimate)
+    sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
+    place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
+    strays = sigma[place][builder.pairs.images[:, 1]] * builder.pairs.length_s
+    astray = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
+    used = inside & (builder.verdict == IN_USE)
+    return bool(used.any() and astray[used].mean() > FEW_ASTRAY)
 
 
 def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tuple[Mask, NDArray[np.intp], float]:
@@ -126,28 +127,21 @@ class Account:
 
 def account(builders: Iterable[Builder], memory: Memory) -> Account | None:
     """The account of the image pairs of a run; None where there are none, or others stand in for them."""
-    for builder in builders:
-        if isinstance(builder, CoplanarityBuilder) and not builder.replaced(memory):
-            verdict = builder.verdict_of(memory)
-            count = np.bincount(verdict, minlength=len(REASONS))
-            inside = verdict[builder.pairs.pair] == IN_USE
-            use = builder.used_matches(memory)
-            refused = builder.refused if memory.settled else ""
-            told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-            return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
-    return None
-
-
-def _keyframes(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[NDArray[np.intp], Mask]:
-    """Keyframe (k,) at each image, the next one where it has none, and which have one."""
-    stamps = builder.image_ns
-    place = np.clip(np.searchsorted(estimate.t_ns, stamps - builder.merge_ns), 0, len(estimate.t_ns) - 1)
-    return place, np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None or builder.replaced(memory):
+        return None
+    verdict = builder.verdict_of(memory)
+    count = np.bincount(verdict, minlength=len(REASONS))
+    inside = verdict[builder.pairs.pair] == IN_USE
+    use = builder.used_matches(memory)
+    refused = builder.refused if memory.settled else ""
+    told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+    return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
 
 
 def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
     """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
-    place, known = _keyframes(builder, estimate)
+    place, known = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, p, v, _ = (x[place] for x in estimate.states())
     pose = np.tile(np.eye(4), (len(place), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = R, p

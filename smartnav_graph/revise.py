@@ -23,12 +23,13 @@ from scipy.stats import chi2
 from smartnav_graph import graduated
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.observation import skew, turned
+from smartnav_graph.factors.smart import SmartBuilder
 from smartnav_graph.factors.vehicle import VehicleBuilder
-from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key
+from smartnav_graph.graph import LAST_STAGE, Builder, Memory, Window, key, one_of
 from smartnav_graph.pair_gate import settled
 from smartnav_graph.row_noise import row_scales
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.track_gate import ROUNDS, chosen, smart_of
+from smartnav_graph.track_gate import ROUNDS, chosen
 from smartnav_graph.variance import noise_scales
 
 Floats = NDArray[np.float64]
@@ -262,7 +263,7 @@ def extra_passes(builders: Iterable[Builder]) -> int:
     """Passes that a graduated loss, and tracks that follow on image pairs, need beyond those of the others."""
     builders = list(builders)
     graduated_too = any(b.config.loss == "gnc" for b in position_builders(builders))
-    return GRADUATED_PASSES * graduated_too + ROUNDS * (smart_of(builders) is not None)
+    return GRADUATED_PASSES * graduated_too + ROUNDS * (one_of(builders, SmartBuilder) is not None)
 
 
 def _grown(builders: Sequence[Builder], estimate: Estimate, memory: Memory) -> Memory:
@@ -305,7 +306,7 @@ def _inertial(
     scales = noise_scales(builders, windows, estimate, memory, level)
     if any(builder.wanders(memory) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
-    if memory.settled or any(isinstance(builder, VehicleBuilder) for builder in builders):
+    if memory.settled or one_of(builders, VehicleBuilder) is not None:
         scales = {name: max(scale, memory.scale(name)) for name, scale in scales.items()}
     if memory.stage < LAST_STAGE:
         scales = {name: min(scale, memory.scale(name)) for name, scale in scales.items()}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
-from smartnav_graph.graph import Memory, Step, indices_of, letters_of
+from smartnav_graph.graph import Memory, Step, indices_of, letters_of, one_of
 from smartnav_graph.problem import Problem
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.incremental import Incremental
@@ -63,11 +63,11 @@ class SeenPairs:
     @classmethod
     def of(cls, problem: Problem, memory: Memory) -> SeenPairs | None:
         """Those of a run; None without images."""
-        for builder in problem.builders:
-            if isinstance(builder, CoplanarityBuilder):
-                use, verdict = builder.used_matches(memory), builder.verdict_of(memory)
-                return cls(camera_name(problem.session, problem.calibration), builder.seen, use, verdict)
-        return None
+        builder = one_of(problem.builders, CoplanarityBuilder)
+        if builder is None:
+            return None
+        use, verdict = builder.used_matches(memory), builder.verdict_of(memory)
+        return cls(camera_name(problem.session, problem.calibration), builder.seen, use, verdict)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from smartnav_graph.factors.camera import BORESIGHT, STREAM
 from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.observation import exp
 from smartnav_graph.factors.smart import CONTRARY, FEW, FLAT, IN_USE, LEAST_SEEN, OUTSIDE, REASONS, SmartBuilder
-from smartnav_graph.graph import Builder, Memory
+from smartnav_graph.graph import Builder, Memory, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.vision.points import Cameras, Points, meet
 
@@ -38,21 +38,16 @@ SCALES = (0.3, 3.0)
 def chosen(builders: Iterable[Builder], estimate: Estimate, memory: Memory) -> Memory:
     """The memory with the tracks that agree with an estimate; unchanged while pairs are not settled, and once tracks
     are."""
-    found = smart_of(builders)
+    found = one_of(builders, SmartBuilder)
     if found is None or found.refused or memory.settled.get(found.name, 0) >= ROUNDS:
         return memory
-    pairs = next((b for b in builders if isinstance(b, CoplanarityBuilder)), None)
+    pairs = one_of(builders, CoplanarityBuilder)
     if pairs is not None and memory.settled.get(pairs.name, 0) < COMPRESSED:
         return memory
     if pairs is not None and pairs.refused:
         found.refused = "smart: tracks are refused as the image pairs are"
         return memory
     return _judged(found, estimate, memory)
-
-
-def smart_of(builders: Iterable[Builder]) -> SmartBuilder | None:
-    """The builder of tracks, where there is one."""
-    return next((b for b in builders if isinstance(b, SmartBuilder)), None)
 
 
 def _judged(builder: SmartBuilder, estimate: Estimate, memory: Memory) -> Memory:
@@ -96,8 +91,7 @@ class _Views(NamedTuple):
 
 def _views(builder: SmartBuilder, estimate: Estimate) -> _Views:
     seen, stamps = builder.sightings, builder.image_ns
-    place = np.clip(np.searchsorted(estimate.t_ns, stamps - builder.merge_ns), 0, len(estimate.t_ns) - 1)
-    known = np.abs(estimate.t_ns[place] - stamps) <= builder.merge_ns
+    place, known = estimate.keyframes_at(stamps, builder.merge_ns)
     known[1:] &= place[1:] != place[:-1]  # a keyframe stands for one image
     R, p, v, bias = (x[place][seen.image.ravel()] for x in estimate.states())
     delay = estimate.offset_s(STREAM) + builder.eye.delay(seen.xy.reshape(-1, 2))
@@ -150,7 +144,7 @@ def whitened(
 ) -> tuple[NDArray[np.int64], Floats, Mask] | None:
     """Keyframe stamps (m,), whitened residuals (m, 2) and whether in use (m,), of the observations of the tracks in
     use; None where tracks are not in force."""
-    builder = smart_of(builders)
+    builder = one_of(builders, SmartBuilder)
     if builder is None or not builder.in_force(memory):
         return None
     seen = builder.sightings
@@ -188,7 +182,7 @@ class Account:
 
 def account(builders: Iterable[Builder], memory: Memory) -> Account | None:
     """The account of the tracks of a run; None where they are not asked for."""
-    builder = smart_of(builders)
+    builder = one_of(builders, SmartBuilder)
     if builder is None:
         return None
     count = np.bincount(builder.verdict, minlength=len(REASONS))

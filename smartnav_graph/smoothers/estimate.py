@@ -88,6 +88,11 @@ class Estimate:
         found = self.session.get(name)
         return np.zeros(size) if found is None else found.value
 
+    def keyframes_at(self, t_ns: NDArray[np.int64], merge_ns: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Keyframe (k,) at each stamp (k,), the next one where it has none within `merge_ns`, and which have one."""
+        place = np.clip(np.searchsorted(self.t_ns, t_ns - merge_ns), 0, len(self.t_ns) - 1)
+        return place, np.abs(self.t_ns[place] - t_ns) <= merge_ns
+
     def stacks(self, sensor: str) -> list[Stack]:
         """The blocks of one sensor, joined; see `Stack.linearize` for their residuals."""
         return self._stacks.get(sensor, [])
