@@ -14,6 +14,7 @@ from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel
 from smartnav_graph.simulation.scenarios import Scenario
 from smartnav_graph.simulation.trajectory import Trajectory
+from smartnav_graph.solution import Solution
 from smartnav_graph.streams import ControlPoint
 from smartnav_graph.timebase import NS, interpolate
 
@@ -71,3 +72,13 @@ def positions(session: Session, t_ns: Any) -> np.ndarray:
 def turned_deg(one: Any, other: Any) -> np.ndarray:
     """Angles (n,) between two stacks of rotations, degrees."""
     return np.degrees(Rotation.from_matrix(np.swapaxes(one, 1, 2) @ other).magnitude())
+
+
+def rms(session: Session, solution: Solution) -> tuple[float, float]:
+    """Root mean square of the position error (m) and of the heading error (deg), at all stamps of the truth that the
+    solution has."""
+    known = np.isin(solution.t_ns, session.reference.t_ns)
+    R, p, _, _ = truth(session, solution.t_ns[known])
+    off = p - solution.nav_t_body[known]
+    yaw = Rotation.from_matrix(R @ solution.nav_R_body[known].transpose(0, 2, 1)).as_rotvec()[:, 2]
+    return float(np.sqrt((off**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((yaw**2).mean())))

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from unittest.mock import patch
 
-import numpy as np
 import pytest
-from test_nees import average_nees, errors, outside
+from sessions import rms
+from test_nees import average_nees, outside
 
 import smartnav_graph as sn
 from smartnav_graph.simulation import recording
@@ -26,24 +26,17 @@ def alone(seed: int) -> sn.Session:
         return TROLLEY(seed)
 
 
-def rms(seed: int) -> tuple[float, float]:
-    """Root mean square over all keyframes of the position error (m) and of the heading error (deg)."""
-    session = alone(seed)
-    solution = sn.smooth(session)
-    known = np.flatnonzero(np.isin(solution.t_ns, session.reference.t_ns))
-    off = np.array([errors(session, solution, int(row)) for row in known])
-    return float(np.sqrt((off[:, 3:6] ** 2).sum(axis=1).mean())), float(np.degrees(np.sqrt((off[:, 2] ** 2).mean())))
-
-
 def test_one_run_is_off_by_metres_and_degrees():
-    position, heading = rms(0)
+    session = alone(0)
+    position, heading = rms(session, sn.smooth(session))
     assert 0.2 < position < 4.5 and 0.5 < heading < 12.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_every_run_stays_within_bounds(seed):
-    position, heading = rms(seed)
+    session = alone(seed)
+    position, heading = rms(session, sn.smooth(session))
     assert position < 4.5 and heading < 12.0
 
 
