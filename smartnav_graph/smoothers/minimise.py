@@ -96,7 +96,7 @@ def minimise(
             if damping > 1e10:
                 return Solve(values, cost, iterations, _stationary(linear, order))
         small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
-        flat = flat + 1 if cost - new_cost <= config.tolerance * max(new_cost, 1.0) else 0
+        flat = flat + 1 if abs(cost - new_cost) <= config.tolerance * max(new_cost, 1.0) else 0
         converged = new_cost <= enough or (damping <= 1.0 and flat > 0 and (small or flat >= FLAT))
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
         recent.append(cost)

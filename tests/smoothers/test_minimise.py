@@ -93,6 +93,24 @@ def test_the_cost_never_rises():
     assert all(after <= before * (1 + 1e-9) + 1e-12 for before, after in pairwise(costs))
 
 
+def test_a_small_step_that_climbs_is_not_the_end():
+    class Valley:
+        """Steps of 1e-5, and costs as they come along a curved valley."""
+
+        costs = iter([10.0, 9.0, 9.5, 5.0, 5.0])
+
+        def linearize(self, values: Any) -> gtsam.GaussianFactorGraph:
+            linear = gtsam.GaussianFactorGraph()
+            linear.add(V, np.eye(3), np.full(3, 1e-5), gtsam.noiseModel.Unit.Create(3))
+            return linear
+
+        def error(self, values: Any) -> float:
+            return next(self.costs)
+
+    solve = minimise(Valley(), at((V, np.zeros(3))), ordering(V), SolveConfig())
+    assert solve.converged and (solve.cost, solve.iterations) == (5.0, 4)
+
+
 def test_the_iteration_limit_is_told():
     solve = minimise(rosenbrock(), at((V, np.array([-1.2, 1.0, 0.0]))), ordering(V), SolveConfig(max_iterations=3))
     assert not solve.converged and solve.iterations == 3
