@@ -20,9 +20,9 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph.run_folder import read_run
-from smartnav_graph.session import Session
-from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
+from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
+from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.session.session import Session
 
 
 def columns_of(session: Session, solution: Solution) -> Iterable[tuple[str, np.ndarray, Any]]:

@@ -17,10 +17,11 @@ from dataclasses import replace
 import gtsam
 
 import smartnav_graph as sn
-from smartnav_graph import estimate
-from smartnav_graph.graph import KEYFRAME_LETTERS, key
-from smartnav_graph.problem import prepare
-from smartnav_graph.progress import silent
+from smartnav_graph.core.progress import silent
+from smartnav_graph.estimate.passes import _window_by_window, solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, key
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.minimise import SolveConfig, minimise
@@ -38,10 +39,10 @@ def make(folder: str) -> None:
 def solve(folder: str) -> dict[str, float]:
     config = sn.Config()
     problem = prepare(sn.load(folder), config)
-    initial = estimate.initialise(problem)
+    initial = initialise(problem)
     builders = [initial.prior, *problem.builders]
-    start, memory = estimate._window_by_window(problem, problem.windows, builders, initial.memory, silent)
-    found, _, _ = estimate.solve_passes(problem, problem.windows, initial.prior, memory, warm=start)
+    start, pass_state = _window_by_window(problem, problem.windows, builders, initial.pass_state, silent)
+    found, _, _ = solve_passes(problem, problem.windows, initial.prior, pass_state, initial_values=start)
     graph, held = gtsam.NonlinearFactorGraph(), {}
     for _, factor in found.factors:
         graph.push_back(factor)

@@ -104,7 +104,8 @@ def measure(kind: str, path: str) -> None:
         measure_recording(Path(path), with_pictures=kind.endswith("pictures"))
         return
     import smartnav_graph as sn
-    from smartnav_graph import estimate  # imports are not measured
+    from smartnav_graph.estimate.replay import replay
+    from smartnav_graph.estimate.run import smooth
 
     session, config = sn.load(path), sn.Config()
     alone = 0.0
@@ -112,7 +113,7 @@ def measure(kind: str, path: str) -> None:
         spacing = replace(config.keyframes, max_spacing_s=IMAGE_PERIOD_S)
         without = replace(config, coplanarity=replace(config.coplanarity, enabled=False), keyframes=spacing)
         begin = time.process_time()
-        estimate.smooth(session, without)
+        smooth(session, without)
         alone = time.process_time() - begin
     if kind == "batch":
         gnss = replace(config.gnss, estimate_sigma=False, time_offset_sigma=0.0)
@@ -121,7 +122,7 @@ def measure(kind: str, path: str) -> None:
     if kind == "replay":
         config = replace(config, replay=replace(config.replay, smoother="fixed-lag", lag_s=10.0, polish=False))
     begin = time.process_time()
-    run = (estimate.replay if kind == "replay" else estimate.smooth)(session, config)
+    run = (replay if kind == "replay" else smooth)(session, config)
     seconds = time.process_time() - begin
     assert run.solution.covariance.shape == (len(run.solution), 15, 15)
     keys = ("keyframes", "iterations", "passes", "converged", "timings_s", "update_ms")
@@ -146,8 +147,8 @@ def measure_front_end(folder: Path) -> None:
     from bare_front_end import DISTORTION, FOCAL, HEIGHT, WIDTH
 
     import smartnav_graph as sn
-    from smartnav_graph.calibration.camera import Camera
-    from smartnav_graph.streams import Images
+    from smartnav_graph.session.calibration.camera import Camera
+    from smartnav_graph.session.streams import Images
     from smartnav_graph.vision.front_end import FrontEndConfig, find
 
     files = np.array(sorted(file.name for file in folder.glob("*.png")), dtype=object)
@@ -186,11 +187,11 @@ def measure_recording(path: Path, *, with_pictures: bool) -> None:
     import rerun  # noqa: F401  imports are not measured
 
     import smartnav_graph as sn
-    from smartnav_graph import estimate
-    from smartnav_graph.rerun_log import write_recording
+    from smartnav_graph.estimate.run import smooth
+    from smartnav_graph.output.rerun_log import write_recording
 
     session = sn.load(path)
-    run = estimate.smooth(session)
+    run = smooth(session)
     if with_pictures:
         session = pictured(session, path.parent / "jpeg", count=2000)
     with tempfile.TemporaryDirectory() as folder:
@@ -209,7 +210,7 @@ def pictured(session: Any, folder: Path, count: int) -> Any:
     import numpy as np
     from bare_front_end import make
 
-    from smartnav_graph.streams import Images
+    from smartnav_graph.session.streams import Images
 
     if not folder.exists():
         make(folder, 20)

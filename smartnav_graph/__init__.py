@@ -46,35 +46,35 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from smartnav_graph.calibration.model import Calibration as Calibration
-    from smartnav_graph.config import Config as Config
-    from smartnav_graph.errors import SmartnavError as SmartnavError
-    from smartnav_graph.estimate import Run as Run
+    from smartnav_graph.core.errors import SmartnavError as SmartnavError
+    from smartnav_graph.estimate.config import Config as Config
+    from smartnav_graph.estimate.run import Run as Run
     from smartnav_graph.evaluation import evaluate as evaluate
+    from smartnav_graph.graph.solution import Solution as Solution
+    from smartnav_graph.output.run_folder import read_run as read_run
+    from smartnav_graph.output.run_folder import write_run as write_run
     from smartnav_graph.readers import load as load
     from smartnav_graph.readers.reference import load_reference as load_reference
-    from smartnav_graph.run_folder import read_run as read_run
-    from smartnav_graph.run_folder import write_run as write_run
-    from smartnav_graph.session import Session as Session
-    from smartnav_graph.session import save as save
+    from smartnav_graph.session.calibration.model import Calibration as Calibration
+    from smartnav_graph.session.session import Session as Session
+    from smartnav_graph.session.session import save as save
     from smartnav_graph.simulation.scenarios import simulate as simulate
-    from smartnav_graph.solution import Solution as Solution
 
 # name -> module that holds it; imported when first asked for, so that the door itself costs nothing
 _ROOMS = {
-    "Calibration": "calibration.model",
-    "Config": "config",
-    "Run": "estimate",
-    "Session": "session",
-    "SmartnavError": "errors",
-    "Solution": "solution",
+    "Calibration": "session.calibration.model",
+    "Config": "estimate.config",
+    "Run": "estimate.run",
+    "Session": "session.session",
+    "SmartnavError": "core.errors",
+    "Solution": "graph.solution",
     "evaluate": "evaluation",
     "load": "readers",
     "load_reference": "readers.reference",
-    "read_run": "run_folder",
-    "save": "session",
+    "read_run": "output.run_folder",
+    "save": "session.session",
     "simulate": "simulation.scenarios",
-    "write_run": "run_folder",
+    "write_run": "output.run_folder",
 }
 
 __all__ = [
@@ -102,8 +102,8 @@ def smooth(session: Session, config: Config | None = None, **options: Any) -> So
     ----------
     session : of `load` or `simulate`
     config : all options; the defaults suit phones and MEMS loggers
-    options : fields of `smartnav_graph.config.RunConfig` over it: vehicle, sensors, withhold, start_s, end_s, initial,
-        rate, passes
+    options : fields of `smartnav_graph.estimate.config.RunConfig` over it: vehicle, sensors, withhold,
+        start_s, end_s, initial, rate, passes
 
     Raises
     ------
@@ -127,9 +127,10 @@ def run(session: Session, config: Config | None = None, *, causal: bool = False,
     """
     import dataclasses
 
-    from smartnav_graph import estimate
-    from smartnav_graph.config import Config, RunConfig
-    from smartnav_graph.errors import ConfigError
+    from smartnav_graph.core.errors import ConfigError
+    from smartnav_graph.estimate.config import Config, RunConfig
+    from smartnav_graph.estimate.replay import replay
+    from smartnav_graph.estimate.run import smooth
 
     known = [field.name for field in dataclasses.fields(RunConfig)]
     unknown = sorted(set(options) - set(known))
@@ -137,4 +138,4 @@ def run(session: Session, config: Config | None = None, *, causal: bool = False,
         raise ConfigError("smooth", f"unknown option {', '.join(unknown)}", f"some of {', '.join(known)}")
     config = config or Config()
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, **options))
-    return (estimate.replay if causal else estimate.smooth)(session, config)
+    return (replay if causal else smooth)(session, config)

@@ -14,21 +14,24 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.config import Config
+from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import BUILDERS, FactorContext
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.graph import STATES, Memory, State, Tag, Window, build_step, key
-from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
-from smartnav_graph.prediction import Kinematics
-from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.graph.interpolate import Kinematics
+from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import STATES, State, key
+from smartnav_graph.graph.update import FactorId, build_update
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Device, Mount, Session
+from smartnav_graph.session.streams import ControlPoint, GnssFix
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.sensors import Biases
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
 from smartnav_graph.smoothers.estimate import Estimate, Posterior
 from smartnav_graph.smoothers.whole_graph import custom_factor
-from smartnav_graph.streams import ControlPoint, GnssFix
-from smartnav_graph.timebase import NS, Gap, ns_from_seconds
 
 GRAVITY = 9.81
 START_NS = 1_000 * NS
@@ -105,14 +108,14 @@ class Graph:
     steps: Sequence[Any]
     values: Any
 
-    def factors(self, *sensors: str) -> list[tuple[Tag, Any]]:
+    def factors(self, *sensors: str) -> list[tuple[FactorId, Any]]:
         """Tagged factors of these sensors."""
         return [item for step in self.steps for item in step.factors if item[0].sensor in sensors]
 
-    def rows(self, *sensors: str) -> list[tuple[Tag, Any]]:
+    def rows(self, *sensors: str) -> list[tuple[FactorId, Any]]:
         """Tagged rows of the blocks of these sensors, each as a factor of its own without loss."""
         return [
-            (Tag(block.sensor, block.t_ns, row), custom_factor(replace(block, loss="none"), i, step.held))
+            (FactorId(block.sensor, block.t_ns, row), custom_factor(replace(block, loss="none"), i, step.held))
             for step in self.steps
             for block in step.blocks
             if block.sensor in sensors
@@ -126,7 +129,7 @@ def assemble(
     *,
     bias: Callable[[Any], np.ndarray] = lambda t: np.zeros((len(t), 6)),
     gaps: Sequence[Gap] = (),
-    memory: Memory | None = None,
+    pass_state: PassState | None = None,
     keyframes: KeyframeConfig | None = None,
     span: tuple[int, int] | None = None,
     known: Mapping[str, Any] = MappingProxyType({}),
@@ -146,7 +149,7 @@ def assemble(
     there, biases = truth(times), bias(times)
     states = [state(there, k, int(t), biases[k]) for k, t in enumerate(times)]
     steps = [
-        build_step(w, states[k - 1] if k else None, builders.values(), memory or Memory(), int(times[0]))
+        build_update(w, states[k - 1] if k else None, builders.values(), pass_state or PassState(), int(times[0]))
         for k, w in enumerate(windows)
     ]
     values = values_of(states)

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.rerun_log import write_recording
-from smartnav_graph.session import Device, Session
-from smartnav_graph.solution import Residuals, Solution
-from smartnav_graph.streams import ControlPoint, GnssFix, Imu, Reference, StaticPeriod
-from smartnav_graph.timebase import NS
-from smartnav_graph.trace import Trace, Updates, Wiring
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.result.diagnostics import Diagnostics, FactorGraphLayout, Updates
+from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.output.rerun_log import write_recording
+from smartnav_graph.session.session import Device, Session
+from smartnav_graph.session.streams import ControlPoint, GnssFix, Imu, Reference, StaticPeriod
 
 T0 = 1_777_629_600 * NS  # 2026-05-01 10:00:00 UTC
 
@@ -107,7 +107,7 @@ SUMMARY = {
 }
 
 
-NO_WIRING = Wiring(*(np.zeros(0, dtype=kind) for kind in (np.str_, np.int64, np.str_, np.int64)))
+NO_WIRING = FactorGraphLayout(*(np.zeros(0, dtype=kind) for kind in (np.str_, np.int64, np.str_, np.int64)))
 
 
 def updates(**changes):
@@ -130,7 +130,7 @@ def updates(**changes):
 
 
 def replayed(**changes):
-    return Trace(make_solution().t_ns, NO_WIRING, updates=updates(**changes))
+    return Diagnostics(make_solution().t_ns, NO_WIRING, updates=updates(**changes))
 
 
 def write(path, **changes):

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.session import Session
+from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ControlPoint
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel
 from smartnav_graph.simulation.scenarios import Scenario
 from smartnav_graph.simulation.trajectory import Trajectory
-from smartnav_graph.solution import Solution
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import NS, interpolate
 
 
 def recorded(

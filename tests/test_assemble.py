@@ -10,13 +10,13 @@ from exact import LEVER, record
 from sessions import positions, recorded, turned_deg, with_gnss
 
 import smartnav_graph as sn
-from smartnav_graph.assemble import Withheld, densify
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.result.assemble import Withheld, resample
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.losses import huber_limit
-from smartnav_graph.session import Mount
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.robust import huber_limit
+from smartnav_graph.session.session import Mount
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_too_many_output_rows_are_refused(run):
     t_ns[-1] = t_ns[0] + 2001 * NS
     problem = replace(run.problem, config=Config(run=RunConfig(rate="1000")))
     with pytest.raises(SessionError, match=r"--rate: 2001000 output rows; expected at most 2 000 000"):
-        densify(problem, replace(run.solution, t_ns=t_ns))
+        resample(problem, replace(run.solution, t_ns=t_ns))
 
 
 def test_a_solution_knows_where_it_is(eight, run):

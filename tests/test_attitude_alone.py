@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 import smartnav_graph as sn
+from smartnav_graph.session.streams import Reference
 from smartnav_graph.simulation.scenarios import Scenario, motions
 from smartnav_graph.simulation.sensors import MagnetometerModel
-from smartnav_graph.streams import Reference
 
 OPEN = "0,0,0,0,1,180"  # somewhere, heading anywhere
 

@@ -11,11 +11,11 @@ from exact import LEVER, record
 from sessions import on_control, recorded, shifted, truth, turned_deg, with_gnss, with_imu
 
 import smartnav_graph as sn
-from smartnav_graph import session as session_model
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SessionError, SolverError
-from smartnav_graph.health import inspect
-from smartnav_graph.session import Mount
+from smartnav_graph.core.errors import ConfigError, SessionError, SolverError
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.session import session as session_model
+from smartnav_graph.session.health import inspect
+from smartnav_graph.session.session import Mount
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.degrade import Degrade, degrade, write_degraded
 from smartnav_graph.simulation.trajectory import Eight, Leg, Legs, Trajectory
@@ -246,14 +246,15 @@ def test_fixes_of_another_motion_do_not_pass_for_a_solution(eight, clean):
 
 def test_every_fix_rejected_is_an_error(eight, monkeypatch):
     """Whatever rejects them: a run without any absolute measurement left is no solution."""
-    from smartnav_graph import estimate
+    from smartnav_graph.estimate import run
+    from smartnav_graph.estimate.passes import solve_passes
 
     def nothing_left(*args, **options):
-        found, memory, passes = solve(*args, **options)
-        return found, replace(memory, rejected={"gnss": frozenset(range(60))}), passes
+        found, pass_state, passes = solve(*args, **options)
+        return found, replace(pass_state, rejected={"gnss": frozenset(range(60))}), passes
 
-    solve = estimate.solve_passes
-    monkeypatch.setattr(estimate, "solve_passes", nothing_left)
+    solve = solve_passes
+    monkeypatch.setattr(run, "solve_passes", nothing_left)
     with pytest.raises(SolverError, match=r"every absolute measurement was rejected \(gnss 60\)"):
         sn.run(eight, initial="0,0,0,0,10,20")
 

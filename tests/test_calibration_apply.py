@@ -10,12 +10,12 @@ import pytest
 from exact import eight, record
 
 import smartnav_graph as sn
-from smartnav_graph.calibration import model
-from smartnav_graph.calibration.apply import corrected
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, ImuErrors
-from smartnav_graph.config import Config
-from smartnav_graph.errors import CalibrationError
-from smartnav_graph.problem import prepare
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.session.calibration import model
+from smartnav_graph.session.calibration.apply import corrected
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, ImuErrors
 
 ACCEL = (1.01, 0.002, -0.003, 0.001, 0.99, 0.004, 0.0, -0.002, 1.005)
 GYRO = (0.98, 0.0, 0.005, -0.004, 1.02, 0.0, 0.003, 0.001, 1.0)

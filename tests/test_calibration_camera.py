@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.calibration import model
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import CalibrationError
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.session.calibration import model
+from smartnav_graph.session.calibration.camera import Camera
 
 EUROC = Camera(
     752, 480, 458.654, 457.296, 367.215, 248.375, distortion=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)

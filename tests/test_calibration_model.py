@@ -7,9 +7,9 @@ import tomllib
 
 import pytest
 
-from smartnav_graph.calibration import model
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise, MagnetometerNoise
-from smartnav_graph.errors import CalibrationError
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.session.calibration import model
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise, MagnetometerNoise
 
 
 def test_text_and_back_is_the_same_calibration():

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph import config as config_model
-from smartnav_graph import estimate
-from smartnav_graph.cli import COMMANDS, command_class, demo, main
+from smartnav_graph.cli import COMMANDS, command_class, demo, main, runs
 from smartnav_graph.cli.options import Estimating, join_values, parse
-from smartnav_graph.run_folder import read_run
+from smartnav_graph.estimate import config as config_model
+from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.session.streams import Images
 from smartnav_graph.smoothers.incremental import Incremental
-from smartnav_graph.streams import Images
 
 START = "--initial 0,0,0,0,3,30"
 FAST = ("--to", "20", *START.split(), "--quiet")
@@ -96,7 +95,7 @@ def test_interrupt_elsewhere_is_130_and_writes_nothing(call, tmp_path, monkeypat
     def interrupted(*_args, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(estimate, "smooth", interrupted)
+    monkeypatch.setattr(runs, "smooth", interrupted)
     code, _, err = call(f"smooth eight --out {tmp_path}/run")
     assert (code, err) == (130, "smartnav: interrupted; nothing was written\n")
     assert list(tmp_path.iterdir()) == []

@@ -7,11 +7,11 @@ import tomllib
 
 import pytest
 
-from smartnav_graph import config
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.errors import ConfigError, SmartnavError
+from smartnav_graph.core.errors import ConfigError, SmartnavError
+from smartnav_graph.estimate import config
+from smartnav_graph.estimate.config import Config, RunConfig
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.keyframes import KeyframeConfig
+from smartnav_graph.graph.keyframes import KeyframeConfig
 
 
 def test_the_defaults_survive_text():

@@ -10,11 +10,11 @@ import pytest
 from exact import GRAVITY, START_NS, angle_deg, record
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.consensus import Agreement, Known, curve_of, starts_agreed
-from smartnav_graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.core.timebase import Gap, ns_from_seconds
+from smartnav_graph.estimate.alignment.in_motion import AlignmentProblem, Known, curve_of, starts_agreed
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.simulation import motions
-from smartnav_graph.timebase import Gap, ns_from_seconds
 
 NOISE = DEVICE_CLASSES["mems"]
 PLANTED = replace(NOISE, gyro_bias_sigma=0.02)  # rad/s: 0.7 rad in the time looked at
@@ -40,7 +40,7 @@ def case(seed: int, off=(), sigma: float = 3.0, gap: bool = False):
     return windows, at, fixes, truth
 
 
-def agreed(windows, at, fixes, truth, turns_deg, sigma: float = 3.0):
+def align_in_motion(windows, at, fixes, truth, turns_deg, sigma: float = 3.0):
     """From the true attitude turned about the vertical, at the first fix and at rest."""
     starts = []
     for turned in turns_deg:
@@ -56,7 +56,7 @@ ROUND = (0, 60, 120, 180, 240, 300)
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
 def test_without_outliers_the_start_is_found_from_any_heading(seed, turned_deg):
     *given, truth = case(seed)
-    best = agreed(*given, truth, [turned_deg])[0]
+    best = align_in_motion(*given, truth, [turned_deg])[0]
     assert not best.outside.any()
     assert np.linalg.norm(best.p - truth.nav_t_body[0]) < 8.0  # m; the heading of a straight drive stays open
 
@@ -69,7 +69,7 @@ def test_without_outliers_the_start_is_found_from_any_heading(seed, turned_deg):
 )
 def test_outliers_are_told_exactly(seed, off):
     *given, truth = case(seed, off)
-    best = agreed(*given, truth, ROUND)[0]
+    best = align_in_motion(*given, truth, ROUND)[0]
     assert np.flatnonzero(best.outside).tolist() == off
 
 
@@ -78,12 +78,12 @@ def test_a_gap_among_the_first_seconds_is_a_change_of_velocity_and_attitude():
     curve = curve_of(given[0], np.zeros(6), NOISE, BIAS_SIGMA)
     kicks = 2 + 3  # two windows of the gap, and ten seconds of noise three times
     assert curve.by.shape == (SECONDS, 3, 6 + 6 * kicks) and len(curve.sigma) == 6 + 6 * kicks
-    assert np.flatnonzero(agreed(*given, truth, ROUND)[0].outside).tolist() == [4, 21, 30]
+    assert np.flatnonzero(align_in_motion(*given, truth, ROUND)[0].outside).tolist() == [4, 21, 30]
 
 
 def test_alike_starts_count_once_and_the_cheapest_comes_first():
     *given, truth = case(1, [5, 6, 7])
-    states = agreed(*given, truth, ROUND)
+    states = align_in_motion(*given, truth, ROUND)
     assert len(states) < 3 * len(ROUND)  # what three points of integration and six headings lead to
     costs = [state.cost for state in states]
     assert costs == sorted(costs)
@@ -95,7 +95,7 @@ def test_many_fixes_are_thinned_and_all_judged():
     windows, at, fixes, truth = case(1)
     curve = curve_of(windows, np.zeros(6), NOISE, BIAS_SIGMA)
     rows = np.repeat(np.arange(len(at)), 20)
-    problem = Agreement(curve.at(rows), fixes[rows], (at[rows] - at[0]) / 1e9, 3.0, GRAVITY, np.zeros(6))
+    problem = AlignmentProblem(curve.at(rows), fixes[rows], (at[rows] - at[0]) / 1e9, 3.0, GRAVITY, np.zeros(6))
     assert (
         len(problem.thinned().t) <= 300 and len(problem.agree(truth.nav_R_body[0], fixes[0], np.zeros(3)).square) == 800
     )

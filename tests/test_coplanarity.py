@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import config
-from smartnav_graph.estimate import replay, smooth
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate import config
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.run import smooth
 from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
-from smartnav_graph.session import Mount
+from smartnav_graph.session.session import Mount
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.timebase import NS
 
 
 def options(**sections):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.differences import MEANING, compare_runs
 from smartnav_graph.evaluation.compare import MEASURES
-from smartnav_graph.run_folder import plain, read_run, write_run
+from smartnav_graph.output.run_comparison import MEANING, compare_runs
+from smartnav_graph.output.run_folder import plain, read_run, write_run
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,13 @@ import pytest
 from sessions import positions, recorded, turned_deg, with_gnss
 
 import smartnav_graph as sn
-from smartnav_graph import estimate
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.graph import Memory
-from smartnav_graph.problem import prepare
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.passes import solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.run import initialise, smooth
+from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.simulation.degrade import Degrade, degrade
 from smartnav_graph.simulation.fixes import Outliers
 
@@ -42,7 +44,7 @@ def test_the_same_session_gives_the_same_bits(eight, run):
 
 
 def test_the_door_and_the_room_are_the_same(eight, run):
-    inner = estimate.smooth(eight, Config())
+    inner = smooth(eight, Config())
     assert np.array_equal(inner.solution.nav_t_body, sn.smooth(eight).nav_t_body)
     assert inner.session.gnss is not None and inner.causal is None and not inner.withheld
     with pytest.raises(ConfigError, match="unknown option outages"):
@@ -102,25 +104,25 @@ def test_outliers_end_at_the_solution_without_them(kind):
 def test_passes_are_bounded_and_told(eight):
     assert sn.run(eight, passes=1).summary["passes"] == 1
     problem = prepare(eight, Config(run=RunConfig(passes=2)))
-    initial = estimate.initialise(problem)
-    _, memory, passes = estimate.solve_passes(problem, problem.windows, initial.prior, Memory())
-    assert 1 <= passes <= 2 and isinstance(memory, Memory)
+    initial = initialise(problem)
+    _, pass_state, passes = solve_passes(problem, problem.windows, initial.prior, PassState())
+    assert 1 <= passes <= 2 and isinstance(pass_state, PassState)
 
 
 def test_the_first_state_may_look_at_thirty_seconds_only(eight):
     problem = prepare(eight, Config())
-    assert estimate.initialise(problem, 10.0).stretch_s <= 10.0
-    assert estimate.initialise(problem, 30.0).stretch_s <= 30.0
+    assert initialise(problem, 10.0).stretch_s <= 10.0
+    assert initialise(problem, 30.0).stretch_s <= 30.0
 
 
 def test_progress_is_told(eight):
     seen = []
-    estimate.smooth(eight, progress=lambda *row: seen.append(row))
+    smooth(eight, progress=lambda *row: seen.append(row))
     assert seen[:2] == [("preparing", 0, 0), ("finding the start", 0, 0)]
     assert seen[2:4] == [("pass 1 of at most 8", 0, 62), ("pass 1 of at most 8", 1, 62)]
     assert seen[-1][0].endswith("solving")
     seen.clear()
-    estimate.replay(eight, progress=lambda *row: seen.append(row))
+    replay(eight, progress=lambda *row: seen.append(row))
     assert seen[2:4] == [("replay", 0, 62), ("replay", 1, 62)] and seen[-1][0].endswith("solving")
 
 

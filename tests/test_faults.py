@@ -10,13 +10,13 @@ import pytest
 from sessions import recorded, with_gnss
 
 import smartnav_graph as sn
-from smartnav_graph.config import Config
+from smartnav_graph.core.timebase import interpolate
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.report.usage import rejections_table
+from smartnav_graph.output.report.usage import rejections_table
 from smartnav_graph.simulation.degrade import Degrade, degrade, write_degraded
 from smartnav_graph.simulation.fixes import Outliers
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.timebase import interpolate
 
 KINDS = {
     "isolated": Outliers("isolated", 0.05, 50.0, 200.0),

@@ -7,9 +7,9 @@ import os
 
 import pytest
 
-from smartnav_graph import files
-from smartnav_graph.errors import SessionError
-from smartnav_graph.files import refuse_existing, refuse_foreign, replacing
+from smartnav_graph.core import files
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing
 
 
 @pytest.fixture(params=["file", "folder"])

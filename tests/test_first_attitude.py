@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from exact import START_NS, angle_deg, record
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.first_attitude import attitude_start
-from smartnav_graph.timebase import ns_from_seconds
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.core.timebase import ns_from_seconds
+from smartnav_graph.estimate.alignment.attitude import attitude_start
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 
 BIAS = np.array([0.1, -0.05, 0.08])  # rad/s, of a phone that its system has not corrected
 SIGMA = 0.05

@@ -9,13 +9,24 @@ import pytest
 from exact import GRAVITY, START_NS, angle_deg
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, MagnetometerNoise
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.first_field import BIAS, FIELD, GRID_S, IRON, UP, FieldStart, Seen, field_start, fit, turns
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.estimate.alignment.magnetic import (
+    BIAS,
+    FIELD,
+    GRID_S,
+    IRON,
+    UP,
+    FieldStart,
+    Seen,
+    field_start,
+    fit,
+    turns,
+)
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, MagnetometerNoise
+from smartnav_graph.session.streams import Imu, Magnetometer
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Trajectory
-from smartnav_graph.streams import Imu, Magnetometer
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 CLASS = DEVICE_CLASSES["mems"]
 NOISE = MagnetometerNoise()

@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import frames
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import LocalFrame, Origin, heading_pitch_roll_deg, nav_R_body_from_heading, normal_gravity
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import (
+    LocalFrame,
+    Origin,
+    heading_pitch_roll_deg,
+    nav_R_body_from_heading,
+    normal_gravity,
+)
 
 ORIGINS = [Origin(52.0, 11.0, 100.0), Origin(-33.9, 151.2, -20.0), Origin(0.0, 0.0, 0.0), Origin(78.0, -179.9, 3000.0)]
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")

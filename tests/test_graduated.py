@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph import graduated
+from smartnav_graph.graph import gnc
 
 SQUARES = np.array([0.0, 0.5, 3.0, 8.0, 20.0, 400.0, 1e4])
 LIMIT = 9.0
@@ -22,25 +22,25 @@ def test_weights_are_the_derivative_of_the_surrogate():
         return np.where(r**2 <= low, r**2, np.where(r**2 >= high, LIMIT, middle))
 
     slope = (rho(r + 1e-6) - rho(r - 1e-6)) / 2e-6 / (2 * r)
-    np.testing.assert_allclose(graduated.weights(r**2, LIMIT, mu), slope, atol=1e-4)
+    np.testing.assert_allclose(gnc.weights(r**2, LIMIT, mu), slope, atol=1e-4)
 
 
 def test_it_begins_with_hardly_any_difference_and_ends_truncated():
-    begin = graduated.weights(SQUARES, LIMIT, graduated.first_control(SQUARES, LIMIT))
+    begin = gnc.weights(SQUARES, LIMIT, gnc.first_control(SQUARES, LIMIT))
     assert (np.diff(begin) <= 0).all() and begin[-1] > 0  # every row still pulls
-    end = graduated.weights(SQUARES, LIMIT, 1e6)
-    assert graduated.settled(end) and end.round().tolist() == [1, 1, 1, 1, 0, 0, 0]
-    assert graduated.weights(SQUARES, LIMIT, np.inf).tolist() == [1, 1, 1, 1, 0, 0, 0]
+    end = gnc.weights(SQUARES, LIMIT, 1e6)
+    assert gnc.settled(end) and end.round().tolist() == [1, 1, 1, 1, 0, 0, 0]
+    assert gnc.weights(SQUARES, LIMIT, np.inf).tolist() == [1, 1, 1, 1, 0, 0, 0]
 
 
 def test_where_no_row_is_near_the_limit_it_is_least_squares_at_once():
     small = np.array([0.1, 4.0])
-    assert graduated.first_control(small, LIMIT) == np.inf and graduated.first_control(np.zeros(0), LIMIT) == np.inf
-    assert graduated.weights(small, LIMIT, np.inf).tolist() == [1.0, 1.0]
+    assert gnc.first_control(small, LIMIT) == np.inf and gnc.first_control(np.zeros(0), LIMIT) == np.inf
+    assert gnc.weights(small, LIMIT, np.inf).tolist() == [1.0, 1.0]
 
 
 def test_the_cost_is_truncated():
-    assert graduated.truncated(SQUARES, LIMIT) == pytest.approx(0.5 * (0.5 + 3 + 8 + 9 + 9 + 9))
+    assert gnc.truncated(SQUARES, LIMIT) == pytest.approx(0.5 * (0.5 + 3 + 8 + 9 + 9 + 9))
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -55,7 +55,7 @@ def test_a_line_through_half_outliers_is_found(seed):
         root = np.sqrt(weight)
         fit = np.linalg.lstsq(A * root[:, None], y * root, rcond=None)[0]
         square = ((y - A @ fit) / 0.1) ** 2
-        mu = graduated.first_control(square, limit) if mu is None else 1.4 * mu
-        weight = graduated.weights(square, limit, mu)
+        mu = gnc.first_control(square, limit) if mu is None else 1.4 * mu
+        weight = gnc.weights(square, limit, mu)
     np.testing.assert_allclose(fit, [3.0, 1.0], atol=0.15)
     assert set(np.flatnonzero(weight < 0.5)) >= set(bad)

@@ -8,22 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from smartnav_graph.graph import (
-    KEYFRAME_LETTERS,
-    LAST_STAGE,
-    SENSORS,
-    STATES,
-    Block,
-    Memory,
-    SessionState,
-    State,
-    Step,
-    Tag,
-    Window,
-    build_step,
-    key,
-)
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, SENSORS, STATES, SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate, build_update
+from smartnav_graph.graph.windows import Window
 
 
 def window(index: int = 3, t_s: float = 7.5) -> Window:
@@ -46,51 +35,51 @@ def test_a_step_asks_every_builder_in_turn():
         def __init__(self, name, stage=0):
             self.name, self.stage = name, stage
 
-        def add(self, step, window, previous, memory):
-            seen.append((self.name, window.index, previous, memory))
-            step.add(Tag(self.name, window.t1_ns), None)
+        def add(self, update, window, previous, pass_state):
+            seen.append((self.name, window.index, previous, pass_state))
+            update.add(FactorId(self.name, window.t1_ns), None)
 
-    memory, previous = Memory(), State(2, 0, None, None)
-    step = build_step(window(), previous, [Spy("imu"), Spy("vehicle", LAST_STAGE), Spy("gnss")], memory, 5 * NS)
-    assert seen == [("imu", 3, previous, memory), ("gnss", 3, previous, memory)]
-    assert [tag.sensor for tag, _ in step.factors] == ["imu", "gnss"]
-    assert (step.index, step.t_ns, step.t_s) == (3, 7_500_000_000, 2.5)
+    pass_state, previous = PassState(), State(2, 0, None, None)
+    update = build_update(window(), previous, [Spy("imu"), Spy("vehicle", LAST_STAGE), Spy("gnss")], pass_state, 5 * NS)
+    assert seen == [("imu", 3, previous, pass_state), ("gnss", 3, previous, pass_state)]
+    assert [tag.sensor for tag, _ in update.factors] == ["imu", "gnss"]
+    assert (update.index, update.t_ns, update.t_s) == (3, 7_500_000_000, 2.5)
 
 
 def test_a_builder_of_the_last_stage_waits_for_it():
     class Late:
         name, stage = "vehicle", LAST_STAGE
 
-        def add(self, step, window, previous, memory):
+        def add(self, step, window, previous, pass_state):
             step.use(CLOCK)
 
-    for memory, there in ((Memory(), False), (Memory(stage=LAST_STAGE), True)):
-        assert bool(build_step(window(), None, [Late()], memory, 0).session) == there
+    for pass_state, there in ((PassState(), False), (PassState(stage=LAST_STAGE), True)):
+        assert bool(build_update(window(), None, [Late()], pass_state, 0).session) == there
 
 
 CLOCK = SessionState("T", "gnss", "gnss_time_offset_s", np.zeros(1), np.array([0.2]))
 
 
 def test_a_session_state_has_one_key_and_may_be_held():
-    step = Step(4, NS, 1.0)
-    assert step.use(CLOCK) == step.use(CLOCK) == CLOCK.key == key("T", SENSORS.index("gnss"))
-    step.hold({"something_else": np.ones(1)})
-    assert list(step.session) == [CLOCK.key] and not step.held
-    step.hold({"gnss_time_offset_s": np.array([0.06])})
-    assert not step.session and step.constants == {CLOCK.key: CLOCK}
-    np.testing.assert_array_equal(step.held[CLOCK.key], [0.06])
+    update = GraphUpdate(4, NS, 1.0)
+    assert update.use(CLOCK) == update.use(CLOCK) == CLOCK.key == key("T", SENSORS.index("gnss"))
+    update.hold({"something_else": np.ones(1)})
+    assert list(update.session) == [CLOCK.key] and not update.held
+    update.hold({"gnss_time_offset_s": np.array([0.06])})
+    assert not update.session and update.constants == {CLOCK.key: CLOCK}
+    np.testing.assert_array_equal(update.held[CLOCK.key], [0.06])
 
 
 def test_a_block_says_of_every_row_where_it_is_from_and_whether_it_counts():
-    block = Block("gnss", None, [(1,), (2,)], np.zeros((2, 3)), NS)
+    block = FactorBatch("gnss", None, [(1,), (2,)], np.zeros((2, 3)), NS)
     assert (block.rows, block.used, block.loss) == ((-1, -1), (True, True), "none")
 
 
 def test_the_values_of_a_step_are_its_own_states():
-    step = Step(4, NS, 1.0, predicted=gtsam.NavState(gtsam.Rot3.Rz(0.3), np.ones(3), 2 * np.ones(3)))
-    step.bias = gtsam.imuBias.ConstantBias(np.full(3, 0.1), np.full(3, 0.2))
-    step.chain[key("C", 4)] = np.full(3, 5.0)
-    values = step.values()
+    update = GraphUpdate(4, NS, 1.0, predicted=gtsam.NavState(gtsam.Rot3.Rz(0.3), np.ones(3), 2 * np.ones(3)))
+    update.bias = gtsam.imuBias.ConstantBias(np.full(3, 0.1), np.full(3, 0.2))
+    update.chain[key("C", 4)] = np.full(3, 5.0)
+    values = update.values()
     assert set(values.keys()) == {key(letter, 4) for letter in "XVBC"}
     np.testing.assert_array_equal(values.atVector(key("V", 4)), 2.0)
     np.testing.assert_array_equal(values.atVector(key("C", 4)), 5.0)
@@ -102,8 +91,12 @@ def test_length_of_a_window():
 
 
 def test_memory_knows_nothing_at_first_and_cannot_be_written():
-    memory = Memory(noise_scales={"gyro": 2.0}, rejected={"gnss": frozenset({3})})
-    assert (memory.scale("gyro"), memory.scale("accel")) == (2.0, 1.0)
-    assert memory.is_rejected("gnss", 3) and not memory.is_rejected("gnss", 4) and not memory.is_rejected("control", 3)
+    pass_state = PassState(noise_scales={"gyro": 2.0}, rejected={"gnss": frozenset({3})})
+    assert (pass_state.scale("gyro"), pass_state.scale("accel")) == (2.0, 1.0)
+    assert (
+        pass_state.is_rejected("gnss", 3)
+        and not pass_state.is_rejected("gnss", 4)
+        and not pass_state.is_rejected("control", 3)
+    )
     with pytest.raises(dataclasses.FrozenInstanceError):
-        memory.phase = "robust"
+        pass_state.phase = "robust"

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import Origin
-from smartnav_graph.health import Health, inspect, tilt_errors
-from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.session.health import Health, inspect, tilt_errors
+from smartnav_graph.session.session import Device, Mount, Session
+from smartnav_graph.session.streams import Barometer, ControlPoint, GnssFix, Imu, Magnetometer, StaticPeriod
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.streams import Barometer, ControlPoint, GnssFix, Imu, Magnetometer, StaticPeriod
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 T0 = 1_748_772_000 * NS
 G = 9.81

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from smartnav_graph.frames import Origin, axis_vector
-from smartnav_graph.health import inspect
-from smartnav_graph.session import Session
+from smartnav_graph.core.frames import Origin, axis_vector
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.health import inspect
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ControlPoint, StaticPeriod, Temperature, Velocity
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.streams import ControlPoint, StaticPeriod, Temperature, Velocity
-from smartnav_graph.timebase import NS
 
 sound = cache(simulate)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
+from smartnav_graph.core.timebase import interpolate
+from smartnav_graph.session.streams import ControlPoint
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.scenarios import Scenario
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import interpolate
 
 
 @pytest.fixture(scope="module", params=["B1", "F2"])

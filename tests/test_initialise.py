@@ -12,29 +12,29 @@ from exact import GRAVITY, START_NS, angle_deg, eight, record
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.estimate import initialise
-from smartnav_graph.factors.prior import PriorConfig
-from smartnav_graph.initialise import (
-    Given,
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.estimate.alignment.initialiser import (
     InitialiseConfig,
     Initialiser,
+    UserStart,
     find_rest,
     inertial_curve,
     kabsch_attitude,
 )
-from smartnav_graph.keyframes import KeyframeConfig, make_windows
-from smartnav_graph.problem import prepare
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.factors.prior import PriorConfig
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.streams import Imu, Magnetometer
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.recording import magnetic_field_ut
 from smartnav_graph.simulation.scenarios import simulate
 from smartnav_graph.simulation.sensors import PROFILES
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
-from smartnav_graph.streams import Imu, Magnetometer
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 NOISE = DEVICE_CLASSES["mems"]  # in motion
 PHONE = PROFILES["galaxy-s2"].noise  # at rest
@@ -199,8 +199,8 @@ def test_too_short_a_rest_does_not_count():
 
 
 def test_given_is_read():
-    assert Given.parse("1,2.5,-3,90") == Given((1.0, 2.5, -3.0), 90.0, 10.0, 10.0)
-    assert Given.parse(" 1, 2,3 ,90 ,0.5,2") == Given((1.0, 2.0, 3.0), 90.0, 0.5, 2.0)
+    assert UserStart.parse("1,2.5,-3,90") == UserStart((1.0, 2.5, -3.0), 90.0, 10.0, 10.0)
+    assert UserStart.parse(" 1, 2,3 ,90 ,0.5,2") == UserStart((1.0, 2.0, 3.0), 90.0, 0.5, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_given_is_read():
 )
 def test_given_that_cannot_be_read(text):
     with pytest.raises(ConfigError) as e:
-        Given.parse(text)
+        UserStart.parse(text)
     assert str(e.value).startswith(f"--initial: {text!r}; expected e,n,u,heading_deg[,sigma_m,sigma_deg] in metres")
 
 
@@ -244,7 +244,7 @@ def initialiser(session, *, fixes: bool = False, **changes) -> Initialiser:
     return Initialiser(**{**values, **changes})
 
 
-def no_solver(prior, count, memory):
+def no_solver(prior, count, pass_state):
     raise AssertionError("nothing to solve")
 
 
@@ -323,7 +323,7 @@ def test_neither_rest_nor_absolute_sensor_is_refused_with_the_way_out():
 def test_a_given_start_is_levelled_and_held_as_told(resting):
     motion = motions.static(30.0) if resting else motions.car(30.0, np.random.default_rng(5), start_speed=12.0)
     recording = record(motion)
-    start = initialiser(recording.session).run(no_solver, Given((1.0, 2.0, 3.0), 123.0, 0.5, 2.0))
+    start = initialiser(recording.session).run(no_solver, UserStart((1.0, 2.0, 3.0), 123.0, 0.5, 2.0))
     prior = start.prior
     assert start.method == "given" and start.heading_deg == 123.0
     assert ("levelled over a rest" in start.sentence) == resting

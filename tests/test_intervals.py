@@ -7,14 +7,14 @@ import pytest
 from exact import record
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import session as session_model
-from smartnav_graph.calibration.model import DEVICE_CLASSES
 from smartnav_graph.cli import main
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.intervals import FIXES, FixesFromReference, intervals, with_fixes
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.evaluation.intervals import FIXES, FixesFromReference, intervals, with_fixes
+from smartnav_graph.session import session as session_model
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.streams import Reference
 from smartnav_graph.simulation import motions
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS
 
 GOOD = FixesFromReference(0.01, 0.5)
 

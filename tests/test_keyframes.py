@@ -9,9 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.keyframes import GAP_SHARE, GAP_SPACING_S, KeyframeConfig, inside, keyframe_times, make_windows
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.graph.keyframes import (
+    GAP_SHARE,
+    GAP_SPACING_S,
+    KeyframeConfig,
+    inside,
+    keyframe_times,
+    make_windows,
+)
+from smartnav_graph.session.streams import Imu
 
 SECOND = KeyframeConfig()
 

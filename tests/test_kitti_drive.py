@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.config import GapConfig
+from smartnav_graph.core.frames import wrap_deg
+from smartnav_graph.estimate.config import GapConfig
 from smartnav_graph.evaluation.metrics import _rotation_error as rotation_error_deg
-from smartnav_graph.frames import wrap_deg
+from smartnav_graph.session.streams import GnssFix
 from smartnav_graph.simulation.degrade import Degrade, degrade
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.streams import GnssFix
 
 MINUTES = range(60, 361, 60)  # s, where the outages begin
 

@@ -9,16 +9,17 @@ import pytest
 from sessions import on_control, positions, recorded, with_gnss, with_imu
 
 import smartnav_graph as sn
-from smartnav_graph import late
-from smartnav_graph.config import Config
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare, recut
+from smartnav_graph.estimate.replay import replay
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.graph import Window
-from smartnav_graph.keyframes import KeyframeConfig
-from smartnav_graph.problem import prepare, recut
-from smartnav_graph.session import Session
+from smartnav_graph.graph import delayed
+from smartnav_graph.graph.keyframes import KeyframeConfig
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import GnssFix
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.streams import GnssFix
-from smartnav_graph.timebase import NS
 
 EMPTY = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
 
@@ -46,7 +47,7 @@ def fixes(t_s: list[float], arrival_s: list[float]) -> GnssFix:
     ],
 )
 def test_a_row_reaches_the_window_in_which_it_arrives(t_s, arrival_s, arrives, speaks):
-    found, lost = late.arrange(windows(0, 1, 2, 3, 4), {"gnss": fixes([t_s], [arrival_s])}, 1000)
+    found, lost = delayed.arrange(windows(0, 1, 2, 3, 4), {"gnss": fixes([t_s], [arrival_s])}, 1000)
     assert [w.index for w in found if w.late] == [arrives] and not lost
     (row,) = found[arrives].late["gnss"]
     assert (row.row, row.t_ns, row.window.index) == (0, round(t_s * NS), speaks)
@@ -57,34 +58,34 @@ def test_late_rows_leave_the_keyframe_they_share_an_epoch_with():
     stream = fixes([1.0, 2.0], [1.0, 2.5])
     made = windows(0, 1, 2, 3)
     made = [replace(w, rows={"gnss": np.array([w.index - 1])} if w.index in (1, 2) else {}) for w in made]
-    found, _ = late.arrange(made, {"gnss": stream}, 1000)
+    found, _ = delayed.arrange(made, {"gnss": stream}, 1000)
     assert found[1].rows["gnss"].tolist() == [0] and not found[2].rows
     assert [row.row for row in found[3].late["gnss"]] == [1]
 
 
 def test_rows_are_handed_over_as_they_arrive_and_lost_ones_counted():
     stream = fixes([0.1, 0.2, 0.3, 0.4], [1.9, 1.5, 9.0, 0.4])
-    found, lost = late.arrange(windows(0, 1, 2), {"gnss": stream}, 1000)
+    found, lost = delayed.arrange(windows(0, 1, 2), {"gnss": stream}, 1000)
     assert [row.row for row in found[2].late["gnss"]] == [1, 0] and lost == {"gnss": 1}
-    assert late.is_late(stream, 1000).tolist() == [True, True, True, False]
+    assert delayed.is_late(stream, 1000).tolist() == [True, True, True, False]
 
 
 def test_nothing_late_changes_nothing():
     made = windows(0, 1, 2)
-    found, lost = late.arrange(made, {"gnss": replace(fixes([1.0], [1.0]), arrival_ns=None)}, 1000)
+    found, lost = delayed.arrange(made, {"gnss": replace(fixes([1.0], [1.0]), arrival_ns=None)}, 1000)
     assert all(one is other for one, other in zip(found, made, strict=True)) and lost == {}
 
 
 def test_what_was_not_known_is_forgotten():
     made = [replace(w, rows={"gnss": np.array([w.index])}) for w in windows(0, 1, 2)]
-    found = late.forget(made, {"gnss": fixes([0.0, 1.0, 2.0], [0.0, 2.5, 2.0])}, 2 * NS)
+    found = delayed.forget(made, {"gnss": fixes([0.0, 1.0, 2.0], [0.0, 2.5, 2.0])}, 2 * NS)
     assert [w.rows for w in found] == [{"gnss": [0]}, {}, {"gnss": [2]}]
 
 
 # --- a whole replay ---------------------------------------------------------------------------------------------------
 
 
-def delayed(session: Session, seconds: float, rows: slice = slice(None)) -> Session:
+def with_delay(session: Session, seconds: float, rows: slice = slice(None)) -> Session:
     """The same fixes, known later."""
     arrival = np.array(session.gnss.t_ns)
     arrival[rows] += round(seconds * NS)
@@ -103,7 +104,7 @@ def config(smoother: str = "fixed-lag", **options) -> Config:
 
 
 def test_no_keyframe_stands_where_nobody_knew_of_a_row():
-    session = delayed(recorded(), 1.3)
+    session = with_delay(recorded(), 1.3)
     options = replace(config(), keyframes=KeyframeConfig(max_spacing_s=1.5))
     causal, batch = prepare(session, options, causal=True), prepare(session, options)
     causal_ns, batch_ns = ([w.t1_ns for w in p.windows] for p in (causal, batch))
@@ -121,7 +122,7 @@ def test_no_keyframe_stands_where_nobody_knew_of_a_row():
 @pytest.mark.parametrize("smoother", ["isam2", "fixed-lag"])
 def test_a_late_row_moves_nothing_before_it_arrives(smoother):
     """Rows after 40 s are moved by 10 m: what was known before the first of them arrived is the same bits."""
-    session = delayed(recorded(), 1.3)
+    session = with_delay(recorded(), 1.3)
     moved = session.gnss.t_ns > session.t0_ns + 40 * NS
     changed = with_gnss(session, lla=session.gnss.lla + 1e-4 * moved[:, None])
     changed = with_imu(changed, accel=session.imu.accel + (session.imu.t_ns > session.t0_ns + 42 * NS)[:, None])
@@ -176,7 +177,7 @@ def test_rows_older_than_the_lag_are_counted_and_told():
 def test_a_replay_whose_fixes_are_all_late(seconds):
     """A latency throughout: a replay like any other, told how many fixes it used."""
     errors = []
-    for session in (recorded(), delayed(recorded(), seconds)):
+    for session in (recorded(), with_delay(recorded(), seconds)):
         run = sn.run(session, config(polish=False), causal=True)
         off = run.causal.nav_t_body - positions(session, run.causal.t_ns)
         errors.append(np.sqrt((off[run.causal.seconds > 31.0, :2] ** 2).sum(axis=1).mean()))
@@ -191,7 +192,7 @@ def test_an_interrupted_replay_polishes_with_what_it_knew():
             raise KeyboardInterrupt
 
     session = with_points()
-    run = sn.estimate.replay(session, config(), progress=interrupted)
+    run = replay(session, config(), progress=interrupted)
     end = run.causal.t_ns[-1]
     used = run.summary["used"]["control"]
     assert used == int((session.control.arrival_ns <= end).sum()) < int((session.control.t_ns <= end).sum())

@@ -10,11 +10,11 @@ from test_coplanarity import errors
 
 import smartnav_graph as sn
 from smartnav_graph.cli import main
-from smartnav_graph.frames import Origin
-from smartnav_graph.run_folder import read_run
-from smartnav_graph.session import save as save_session
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.session.session import save as save_session
+from smartnav_graph.session.streams import PoseFix
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.streams import PoseFix
 
 # nav -> the model: another scale, frame and origin; noise of its poses
 SCALE, MAP_R_NAV, MAP_T_NAV = 0.21, Rotation.from_euler("xyz", [70, -20, 140], degrees=True), np.array([5.0, 2.0, -3.0])

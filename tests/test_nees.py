@@ -14,7 +14,7 @@ from sessions import on_control, positions, recorded, truth, with_gnss
 
 import smartnav_graph as sn
 from smartnav_graph.evaluation.consistency import average_nees_bounds, nees
-from smartnav_graph.session import Session
+from smartnav_graph.session.session import Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.scenarios import Scenario

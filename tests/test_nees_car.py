@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_nees import average_nees, outside, too_sure
 
-from smartnav_graph.session import Session
+from smartnav_graph.session.session import Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel
 from smartnav_graph.simulation.scenarios import Scenario

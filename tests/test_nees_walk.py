@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from test_nees import average_nees, outside
 
-from smartnav_graph.session import Session
+from smartnav_graph.core.timebase import interpolate
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ControlPoint
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.scenarios import Scenario
 from smartnav_graph.simulation.sensors import BarometerModel
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import interpolate
 
 SEEDS = 15
 

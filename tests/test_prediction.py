@@ -9,10 +9,10 @@ import pytest
 from exact import GRAVITY, START_NS, angle_deg, eight, kinematics, record
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.keyframes import KeyframeConfig, make_windows
-from smartnav_graph.prediction import Kinematics, states_at
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.graph.interpolate import Kinematics, states_at
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
 from smartnav_graph.simulation import motions
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 MOTIONS = {
     "figure eight": lambda: eight(30.0),

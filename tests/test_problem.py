@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from sessions import on_control, recorded, shifted, with_gnss
 
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.problem import prepare
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.session.streams import Temperature
 from smartnav_graph.simulation.degrade import Degrade, degrade
-from smartnav_graph.streams import Temperature
-from smartnav_graph.timebase import NS
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +105,8 @@ def test_gaps_outside_the_stretch_are_not_told_as_gaps(eight):
 
 
 def test_streams_without_a_factor_are_told(eight):
-    warm = Temperature(t_ns=eight.imu.t_ns[:2], temperature_c=[20.0, 20.5])
-    warnings = prepare(eight.replace(temperature=warm), Config()).warnings
+    initial_values = Temperature(t_ns=eight.imu.t_ns[:2], temperature_c=[20.0, 20.5])
+    warnings = prepare(eight.replace(temperature=initial_values), Config()).warnings
     assert "temperature: present, not used by the estimator" in warnings
 
 
@@ -122,8 +122,8 @@ def test_without_inertial_data(eight):
 
 
 def test_pictures_that_nobody_matched_are_told():
+    from smartnav_graph.session.streams import Images
     from smartnav_graph.simulation.scenarios import simulate
-    from smartnav_graph.streams import Images
 
     session = simulate("figure-eight-60s", 0)
     rows = session.imu.t_ns[:300:100]

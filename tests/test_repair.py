@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.repair import REPAIRS, check_names, repair
-from smartnav_graph.streams import GnssFix, Imu, Tracks
-from smartnav_graph.timebase import NS, ns_from_seconds
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.session.repair import REPAIRS, check_names, repair
+from smartnav_graph.session.streams import GnssFix, Imu, Tracks
 
 
 def imu_table(n: int = 2000, hertz: float = 100.0) -> dict[str, np.ndarray]:

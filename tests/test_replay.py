@@ -7,17 +7,19 @@ import pytest
 from sessions import positions, recorded, shifted, turned_deg, with_gnss, with_imu
 
 import smartnav_graph as sn
-from smartnav_graph import estimate
-from smartnav_graph.config import Config
-from smartnav_graph.graph import Memory, build_step
-from smartnav_graph.problem import prepare
-from smartnav_graph.run_folder import read_run, write_run
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.update import build_update
+from smartnav_graph.output.run_folder import read_run, write_run
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
-from smartnav_graph.timebase import NS
 
 SMOOTHERS = ("isam2", "fixed-lag")
 
@@ -28,12 +30,14 @@ def configured(smoother: str, **options) -> Config:
 
 def build_steps(problem):
     """Steps of a problem, built once: preintegration depends on the bias it is made at."""
-    initial = estimate.initialise(problem)
+    initial = initialise(problem)
     maker = Batch(problem.config.batch, problem.config.solve, None, problem.session.t0_ns)
     for window in problem.windows:
-        step = build_step(window, maker.latest(), [initial.prior, *problem.builders], Memory(), problem.session.t0_ns)
-        step.refresh = None  # never again
-        maker.update(step)
+        update = build_update(
+            window, maker.latest(), [initial.prior, *problem.builders], PassState(), problem.session.t0_ns
+        )
+        update.refresh = None  # never again
+        maker.update(update)
     return maker.steps
 
 
@@ -109,7 +113,7 @@ def test_an_interrupt_leaves_a_valid_partial_run(smoother, tmp_path):
             raise KeyboardInterrupt
 
     session = recorded()
-    run = estimate.replay(session, configured(smoother), progress=interrupted)
+    run = replay(session, configured(smoother), progress=interrupted)
     assert run.summary["mode"] == f"replay {smoother}, interrupted"
     assert len(run.causal) == len(run.solution) == run.summary["keyframes"] == 21
     assert 18.0 < run.solution.seconds[-1] <= 20.0 and np.isfinite(run.solution.covariance).all()
@@ -124,7 +128,7 @@ def test_an_interrupt_before_there_is_anything_goes_through():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate.replay(recorded(), configured("fixed-lag"), progress=interrupted)
+        replay(recorded(), configured("fixed-lag"), progress=interrupted)
 
 
 def test_a_heading_open_for_long_does_not_lengthen_the_delay():

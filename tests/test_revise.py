@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 from exact import LEVER, assemble, estimate_of, record, state
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.estimate import initialise, solve_passes
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.passes import solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.reweight.outliers import fix_residuals
+from smartnav_graph.estimate.reweight.update import LEAST_SIGMA, update_pass_state
+from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph import Memory
-from smartnav_graph.problem import prepare
-from smartnav_graph.revise import LEAST_SIGMA, fix_residuals, revise
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
+from smartnav_graph.session.streams import GnssFix
 from smartnav_graph.simulation import motions
-from smartnav_graph.streams import GnssFix
 
 GOOD_SEED = 1  # of 174 good fixes none lies outside the gate by itself
 WHITE = GnssNoise(correlated_horizontal_sigma=0.0, correlated_vertical_sigma=0.0)  # 3 m and 5 m, no wander
@@ -47,7 +49,7 @@ def with_fixes(drive, sigma, told=None, seed: int = 0, off=()):
     return drive.session.replace(gnss=GnssFix(t_ns=fix.t_ns, enu=enu, sigma=told))
 
 
-def learn(drive, session) -> tuple[Memory, int]:
+def learn(drive, session) -> tuple[PassState, int]:
     """What all passes have learnt, started at the truth, and their number."""
     problem = prepare(session, Config(run=RunConfig(passes=10)))
     t_ns = problem.windows[0].t1_ns
@@ -61,8 +63,8 @@ def learn(drive, session) -> tuple[Memory, int]:
         start.nav.velocity(),
         start.bias,
     )
-    _, memory, passes = solve_passes(problem, problem.windows, prior, Memory())
-    return memory, passes
+    _, pass_state, passes = solve_passes(problem, problem.windows, prior, PassState())
+    return pass_state, passes
 
 
 # --- sigma ------------------------------------------------------------------------------------------------------------
@@ -71,26 +73,26 @@ def learn(drive, session) -> tuple[Memory, int]:
 @pytest.mark.parametrize("planted", [0.3, 1.2, 4.0])
 def test_the_sigma_of_fixes_is_found_within_fifteen_per_cent(drive, planted):
     # about 300 residuals: 1 / sqrt(600) = 4 %
-    memory, passes = learn(drive, with_fixes(drive, [planted, planted, planted * 5 / 3]))
-    assert 3.0 * memory.scale("gnss") == pytest.approx(planted, rel=0.15)
-    assert memory.rejected.get("gnss", frozenset()) == frozenset() and passes < 10
+    pass_state, passes = learn(drive, with_fixes(drive, [planted, planted, planted * 5 / 3]))
+    assert 3.0 * pass_state.scale("gnss") == pytest.approx(planted, rel=0.15)
+    assert pass_state.rejected.get("gnss", frozenset()) == frozenset() and passes < 10
 
 
 def test_a_sigma_that_came_with_the_data_is_left_alone(drive):
-    memory, _ = learn(drive, with_fixes(drive, [1.0, 1.0, 1.0], told=[3.0, 3.0, 3.0]))
-    assert memory.scale("gnss") == 1.0
+    pass_state, _ = learn(drive, with_fixes(drive, [1.0, 1.0, 1.0], told=[3.0, 3.0, 3.0]))
+    assert pass_state.scale("gnss") == 1.0
 
 
 def test_exact_fixes_are_believed_no_better_than_three_centimetres(drive):
-    memory, _ = learn(drive, with_fixes(drive, [1e-6, 1e-6, 1e-6]))
-    assert 3.0 * memory.scale("gnss") >= LEAST_SIGMA - 1e-12
+    pass_state, _ = learn(drive, with_fixes(drive, [1e-6, 1e-6, 1e-6]))
+    assert 3.0 * pass_state.scale("gnss") >= LEAST_SIGMA - 1e-12
 
 
 def test_outliers_do_not_swell_the_sigma(drive):
     off = frozenset({7, 30, 31, 32, 70, 95})
-    memory, _ = learn(drive, with_fixes(drive, [1.2, 1.2, 2.0], off=off))
-    assert 3.0 * memory.scale("gnss") == pytest.approx(1.2, rel=0.2)
-    assert memory.rejected["gnss"] == off
+    pass_state, _ = learn(drive, with_fixes(drive, [1.2, 1.2, 2.0], off=off))
+    assert 3.0 * pass_state.scale("gnss") == pytest.approx(1.2, rel=0.2)
+    assert pass_state.rejected["gnss"] == off
 
 
 # --- outliers ---------------------------------------------------------------------------------------------------------
@@ -103,17 +105,17 @@ def test_outliers_do_not_swell_the_sigma(drive):
     ids=["one", "several", "a burst of six seconds", "near the end", "an early burst", "near the start"],
 )
 def test_planted_outliers_are_found_exactly(drive, off):
-    memory, _ = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED))
-    assert memory.rejected["gnss"] == frozenset(off)
-    assert memory.phase == "gated"
+    pass_state, _ = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED))
+    assert pass_state.rejected["gnss"] == frozenset(off)
+    assert pass_state.phase == "gated"
 
 
 def test_graduated_non_convexity_finds_them_too(drive):
     off = frozenset({8, 40, 41, 42, 43, 90, 120})
     problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), gnc())
     initial = initialise(problem)
-    _, memory, passes = solve_passes(problem, problem.windows, initial.prior, Memory())
-    assert memory.rejected["gnss"] == off and memory.phase == "gated" and not memory.weights
+    _, pass_state, passes = solve_passes(problem, problem.windows, initial.prior, PassState())
+    assert pass_state.rejected["gnss"] == off and pass_state.phase == "gated" and not pass_state.weights
     assert 6 <= passes <= 20  # the control grows fourfold a pass
 
 
@@ -124,14 +126,14 @@ def gnc() -> Config:
 def test_the_control_grows_until_every_weight_is_settled(drive):
     session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
     builders, windows, estimate = at_truth(drive, session, loss="gnc")
-    memory, controls = Memory(phase="robust"), []
-    while memory.phase != "gated":
-        memory, done = revise(builders, windows, estimate, memory)
+    pass_state, controls = PassState(phase="robust"), []
+    while pass_state.phase != "gated":
+        pass_state, done = update_pass_state(builders, windows, estimate, pass_state)
         assert not done
-        controls.append(memory.control)
-        if memory.phase == "graduated":
-            assert memory.weight("gnss", 40) < 0.5 * memory.weight("gnss", 41)
-    assert memory.rejected == {"gnss": frozenset({40})} and not memory.weights
+        controls.append(pass_state.control)
+        if pass_state.phase == "graduated":
+            assert pass_state.weight("gnss", 40) < 0.5 * pass_state.weight("gnss", 41)
+    assert pass_state.rejected == {"gnss": frozenset({40})} and not pass_state.weights
     assert np.allclose(np.diff(np.log(controls[:-1])), np.log(4.0))
 
 
@@ -139,20 +141,20 @@ def test_the_control_grows_until_every_weight_is_settled(drive):
 def test_outliers_among_the_first_fixes_do_not_mislead_the_start(drive, off):
     problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), Config())
     initial = initialise(problem)
-    _, memory, _ = solve_passes(problem, problem.windows, initial.prior, initial.memory)
-    assert memory.rejected["gnss"] == frozenset(off)
+    _, pass_state, _ = solve_passes(problem, problem.windows, initial.prior, initial.pass_state)
+    assert pass_state.rejected["gnss"] == frozenset(off)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_good_fixes_are_all_kept_without_a_robust_pass(drive, seed):
-    memory, passes = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, seed=seed))
-    assert not memory.rejected.get("gnss") and memory.phase == "plain" and passes <= 5  # the noise is found
+    pass_state, passes = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, seed=seed))
+    assert not pass_state.rejected.get("gnss") and pass_state.phase == "plain" and passes <= 5  # the noise is found
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sigmas_too_small_by_three_reject_nothing_wholesale(drive, seed):
-    memory, _ = learn(drive, with_fixes(drive, [3.0] * 3, told=[1.0] * 3, seed=seed))
-    assert len(memory.rejected.get("gnss", ())) <= 2  # of 130
+    pass_state, _ = learn(drive, with_fixes(drive, [3.0] * 3, told=[1.0] * 3, seed=seed))
+    assert len(pass_state.rejected.get("gnss", ())) <= 2  # of 130
 
 
 def test_a_loss_that_is_no_gate_rejects_nothing(drive):
@@ -160,10 +162,10 @@ def test_a_loss_that_is_no_gate_rejects_nothing(drive):
     for loss in ("huber", "none"):
         problem = prepare(session, Config(gnss=GnssConfig(loss=loss), imu=ImuConfig(estimate_noise=False)))
         graph = assemble(session, drive.truth)
-        learnt, done = revise(problem.builders, graph.windows, estimate_of(graph), Memory())
+        learnt, done = update_pass_state(problem.builders, graph.windows, estimate_of(graph), PassState())
         assert learnt.phase == "plain" and not learnt.rejected
         assert not done and learnt.stage == 1  # the clock joins
-        assert revise(problem.builders, graph.windows, estimate_of(graph), learnt) == (learnt, True)
+        assert update_pass_state(problem.builders, graph.windows, estimate_of(graph), learnt) == (learnt, True)
 
 
 # --- one step at a time, at the true states ---------------------------------------------------------------------------
@@ -181,7 +183,7 @@ def test_residuals_are_those_of_the_antenna(drive):
     session = with_fixes(drive, [0.0] * 3)
     shifted = session.replace(gnss=replace(session.gnss, enu=session.gnss.enu - [1.0, 2.0, 3.0]))
     (builder,), windows, estimate = at_truth(drive, shifted)
-    found = fix_residuals(builder, windows, estimate, Memory(noise_scales={"gnss": 2.0}))
+    found = fix_residuals(builder, windows, estimate, PassState(noise_scales={"gnss": 2.0}))
     np.testing.assert_allclose(found.residual, np.tile([1.0, 2.0, 3.0], (len(session.gnss), 1)), atol=1e-6)
     np.testing.assert_allclose(found.sigma, np.tile([6.0, 6.0, 10.0], (len(session.gnss), 1)))
     np.testing.assert_allclose(found.square, 1 / 36 + 4 / 36 + 9 / 100)
@@ -196,15 +198,15 @@ def test_the_variance_component_uses_the_redundancy(drive):
     builders, windows, estimate = at_truth(drive, session)
     half = np.zeros((len(windows), 15, 15))
     half[:, range(3, 6), range(3, 6)] = np.array([9.0, 9.0, 25.0]) / 2  # half of the default's variance
-    plain, _ = revise(builders, windows, estimate, Memory())
-    learnt, _ = revise(builders, windows, replace(estimate, covariance=half), Memory())
+    plain, _ = update_pass_state(builders, windows, estimate, PassState())
+    learnt, _ = update_pass_state(builders, windows, replace(estimate, covariance=half), PassState())
     assert plain.scale("gnss") == pytest.approx(0.2, rel=0.1)
     assert learnt.scale("gnss") == pytest.approx(plain.scale("gnss") * np.sqrt(2), rel=0.01)
 
 
 def test_a_step_of_the_scale_is_bounded(drive):
     builders, windows, estimate = at_truth(drive, with_fixes(drive, [300.0, 300.0, 500.0]))
-    learnt, done = revise(builders, windows, estimate, Memory())
+    learnt, done = update_pass_state(builders, windows, estimate, PassState())
     assert learnt.scale("gnss") == pytest.approx(5.0) and not done
 
 
@@ -212,25 +214,25 @@ def test_too_few_fixes_teach_no_sigma(drive):
     session = with_fixes(drive, [30.0] * 3)
     session = session.replace(gnss=session.gnss.take(slice(0, 3)))
     builders, windows, estimate = at_truth(drive, session, loss="none", time_offset_sigma=0.0)
-    assert revise(builders, windows, estimate, Memory()) == (Memory(), True)
+    assert update_pass_state(builders, windows, estimate, PassState()) == (PassState(), True)
 
 
 def test_phases_follow_each_other(drive):
     session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
     builders, windows, estimate = at_truth(drive, session)
-    one, done = revise(builders, windows, estimate, Memory())
+    one, done = update_pass_state(builders, windows, estimate, PassState())
     assert (one.phase, done, dict(one.rejected)) == ("robust", False, {})
-    two, done = revise(builders, windows, estimate, one)
+    two, done = update_pass_state(builders, windows, estimate, one)
     assert (two.phase, done, dict(two.rejected)) == ("gated", False, {"gnss": frozenset({40})})
-    three, done = revise(builders, windows, estimate, two)
+    three, done = update_pass_state(builders, windows, estimate, two)
     assert (three, done) == (replace(two, stage=1), False)  # what needs the trajectory found joins
-    assert revise(builders, windows, estimate, three) == (three, True)
+    assert update_pass_state(builders, windows, estimate, three) == (three, True)
 
 
 def test_a_row_inside_the_gate_is_let_in_again(drive):
     builders, windows, estimate = at_truth(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3))
-    rejected = Memory(phase="gated", rejected={"gnss": frozenset({5, 6})})
-    learnt, done = revise(builders, windows, estimate, rejected)
+    rejected = PassState(phase="gated", rejected={"gnss": frozenset({5, 6})})
+    learnt, done = update_pass_state(builders, windows, estimate, rejected)
     assert learnt.rejected["gnss"] == frozenset() and not done
 
 
@@ -238,4 +240,4 @@ def test_without_positions_there_is_nothing_to_learn(drive):
     graph = assemble(drive.session, drive.truth)
     inertial = graph.builders["imu"]
     inertial.config = ImuConfig(estimate_noise=False)
-    assert revise([inertial], graph.windows, estimate_of(graph), Memory()) == (Memory(), True)
+    assert update_pass_state([inertial], graph.windows, estimate_of(graph), PassState()) == (PassState(), True)

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_coplanarity import errors
 
-from smartnav_graph import config
-from smartnav_graph.estimate import replay, smooth
+from smartnav_graph.estimate import config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.run import smooth
 from smartnav_graph.factors.camera import Motion
-from smartnav_graph.problem import prepare
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.vision.epipolar import sampson
 
@@ -43,7 +44,7 @@ def misses(session, row_time):
     shift = None if pairs.shift is None else pairs.shift[:, None]
     residual = np.abs(sampson(turn, way, pairs.x0[:, None], pairs.x1[:, None], 1e-3, shift).residual)
     far = np.linalg.norm(way, axis=1) > 0.1  # m
-    return np.quantile(residual[far], [0.5, 0.99]) * builder.eye.camera.focal
+    return np.quantile(residual[far], [0.5, 0.99]) * builder.camera_model.camera.focal
 
 
 def test_nothing_is_left_at_the_truth():
@@ -78,7 +79,7 @@ def test_a_replay_has_row_times_too(room):
 def test_the_readout_is_that_of_the_images_or_of_the_calibration(room):
     def readout(session, row_time=True):
         builders = prepare(session, options(row_time)).builders
-        return next(b for b in builders if b.name == "coplanarity").eye.readout_s
+        return next(b for b in builders if b.name == "coplanarity").camera_model.readout_s
 
     assert readout(room) == READOUT_S
     assert readout(room, row_time=False) == 0.0

@@ -9,11 +9,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from smartnav_graph.graph import Block, Memory, key
-from smartnav_graph.row_noise import correlation_factor, row_scales
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.reweight.constraint_noise import correlation_factor, row_scales
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import FactorBatch
 from smartnav_graph.smoothers.estimate import Posterior
 from smartnav_graph.smoothers.whole_graph import stacks_of
-from smartnav_graph.timebase import NS
 
 
 def markov(n: int, rho: float, seed: int) -> np.ndarray:
@@ -65,7 +67,8 @@ def estimate(speeds: np.ndarray, variance: float = 0.0, used: bool = True):
         values.insert(key("X", k), gtsam.Pose3())
         values.insert(key("V", k), np.array([x, y, 0.0]))
     blocks = [
-        Block("car", MODEL, [(key("X", k), key("V", k))], np.zeros((1, 1)), k * NS, used=(used,)) for k in range(n)
+        FactorBatch("car", MODEL, [(key("X", k), key("V", k))], np.zeros((1, 1)), k * NS, used=(used,))
+        for k in range(n)
     ]
     joint = np.tile(np.diag([0.0] * 6 + [variance] * 3 + [0.0] * 6), (n, 1, 1))
     return SimpleNamespace(
@@ -78,13 +81,13 @@ def estimate(speeds: np.ndarray, variance: float = 0.0, used: bool = True):
 
 def test_white_rows_as_noisy_as_the_class_says_stay():
     rows = np.random.default_rng(1).standard_normal((400, 2)) * [0.1, 0.2]
-    scales = row_scales([Builder()], estimate(rows), Memory())
+    scales = row_scales([Builder()], estimate(rows), PassState())
     assert scales == pytest.approx({"left": 1.0, "up": 1.0}, abs=0.15)
 
 
 def test_noisier_and_slower_rows_get_a_larger_sigma():
     rows = np.stack([0.3 * np.random.default_rng(1).standard_normal(400), 0.2 * markov(400, 0.8, 2)], axis=1)
-    scales = row_scales([Builder()], estimate(rows), Memory())
+    scales = row_scales([Builder()], estimate(rows), PassState())
     assert scales["left"] == pytest.approx(3.0, rel=0.15)
     assert scales["up"] == pytest.approx(3.0, rel=0.35)  # sqrt(1.8 / 0.2), held at one by the class
 
@@ -92,18 +95,18 @@ def test_noisier_and_slower_rows_get_a_larger_sigma():
 def test_what_the_solution_took_up_counts():
     # half the variance of each first row is in the solution
     rows = np.random.default_rng(1).standard_normal((400, 2)) * [0.3, 0.2]
-    free = row_scales([Builder()], estimate(rows), Memory())["left"]
-    bound = row_scales([Builder()], estimate(rows, variance=0.005), Memory())["left"]
+    free = row_scales([Builder()], estimate(rows), PassState())["left"]
+    bound = row_scales([Builder()], estimate(rows, variance=0.005), PassState())["left"]
     assert bound == pytest.approx(np.sqrt(2.0) * free, rel=0.05)
 
 
 def test_quieter_rows_never_fall_below_the_class():
     rows = 1e-3 * np.random.default_rng(1).standard_normal((400, 2))
-    assert row_scales([Builder()], estimate(rows), Memory()) == {"left": 1.0, "up": 1.0}
+    assert row_scales([Builder()], estimate(rows), PassState()) == {"left": 1.0, "up": 1.0}
 
 
 def test_few_rows_and_unused_rows_teach_nothing():
     rows = np.random.default_rng(1).standard_normal((400, 2))
-    assert row_scales([Builder()], estimate(rows[:8]), Memory()) == {}
-    assert row_scales([Builder()], estimate(rows, used=False), Memory()) == {}
-    assert row_scales([Builder(noise_groups={})], estimate(rows), Memory()) == {}
+    assert row_scales([Builder()], estimate(rows[:8]), PassState()) == {}
+    assert row_scales([Builder()], estimate(rows, used=False), PassState()) == {}
+    assert row_scales([Builder(noise_groups={})], estimate(rows), PassState()) == {}

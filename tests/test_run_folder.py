@@ -14,10 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph import config, rerun_log
-from smartnav_graph.calibration import model as calibration_model
-from smartnav_graph.errors import SessionError
-from smartnav_graph.run_folder import check_out, config_differences, plain, read_run, recorded, write_run
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.estimate import config
+from smartnav_graph.output import rerun_log
+from smartnav_graph.output.run_folder import check_out, config_differences, plain, read_run, recorded, write_run
+from smartnav_graph.session.calibration import model as calibration_model
 
 OPTIONS = {"end_s": 20.0, "initial": "0,0,0,0,3,30"}
 

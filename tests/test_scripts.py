@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.run_folder import write_run
+from smartnav_graph.output.run_folder import write_run
 
 ROOT = Path(__file__).parents[1]
 

@@ -13,12 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from smartnav_graph import frames, session
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration
-from smartnav_graph.errors import ConfigError, SessionError, SmartnavError
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.session import Device, Mount, Session, load, save
-from smartnav_graph.streams import STREAMS, GnssFix, Imu, Positioned
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import ConfigError, SessionError, SmartnavError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.session import session
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration
+from smartnav_graph.session.session import Device, Mount, Session, load, save
+from smartnav_graph.session.streams import STREAMS, GnssFix, Imu, Positioned
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 

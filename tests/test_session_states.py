@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.config import Config
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.session import Mount
+from smartnav_graph.session.session import Mount
 from smartnav_graph.simulation.scenarios import SCENARIOS
 
 

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 from test_coplanarity import errors
 
-from smartnav_graph import config
-from smartnav_graph.estimate import initialise, replay, smooth, solve_passes
+from smartnav_graph.estimate import config
+from smartnav_graph.estimate.passes import solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.reweight.track_outliers import chosen
+from smartnav_graph.estimate.run import initialise, smooth
 from smartnav_graph.factors.smart import IN_USE, REASONS
-from smartnav_graph.graph import KEYFRAME_LETTERS, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, key
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
 from smartnav_graph.smoothers.whole_graph import WholeGraph
-from smartnav_graph.track_gate import chosen
 
 
 def options(**sections):
@@ -132,19 +134,21 @@ def solved(room):
     """The first seconds: problem, estimate and memory with tracks in force."""
     problem = prepare(room, options(run={"end_s": 9.0}))
     initial = initialise(problem)
-    estimate, memory, _ = solve_passes(problem, problem.windows, initial.prior, initial.memory, warm=initial.warm)
-    assert memory.settled["smart"] == 2
-    return problem, estimate, memory
+    estimate, pass_state, _ = solve_passes(
+        problem, problem.windows, initial.prior, initial.pass_state, initial_values=initial.initial_values
+    )
+    assert pass_state.settled["smart"] == 2
+    return problem, estimate, pass_state
 
 
 def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
-    problem, estimate, memory = solved
+    problem, estimate, pass_state = solved
     builder = replace(next(b for b in problem.builders if b.name == "smart"))
     pairs = next(b for b in problem.builders if b.name == "coplanarity")
-    assert pairs.replaced(memory) and "images_time_offset_s" in memory.held
+    assert pairs.replaced(pass_state) and "images_time_offset_s" in pass_state.held
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, builder.sightings.xy.shape)
     builder.sightings = replace(builder.sightings, xy=xy)
-    first = replace(memory, settled={**memory.settled, "smart": 1})
+    first = replace(pass_state, settled={**pass_state.settled, "smart": 1})
     again = chosen([builder, pairs], estimate, first)
     assert not pairs.replaced(again) and not builder.in_force(again)
     assert "images_time_offset_s" not in again.held and "camera_boresight_rad" not in again.held

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import session, solution
-from smartnav_graph.frames import Origin
-from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Residuals, Solution
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.graph import solution
+from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Residuals, Solution
+from smartnav_graph.session import session
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 T0 = 1_748_772_000_000_000_000

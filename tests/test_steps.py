@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from smartnav_graph import readers, simulation
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.session.detect.steps import LOOKAHEAD_S, Steps, find_steps, regular_share
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.simulation import motions, scenarios
-from smartnav_graph.steps import LOOKAHEAD_S, Steps, find_steps, regular_share
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 START_NS = 1_748_772_000 * NS
 

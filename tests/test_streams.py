@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from filled import example
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.streams import STREAMS, ControlPoint, GnssFix, Imu, PoseFix, StaticPeriod
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, PoseFix, StaticPeriod
 
 
 def message(error: pytest.ExceptionInfo[SessionError]) -> str:

@@ -9,7 +9,7 @@ import pytest
 from sessions import on_control, recorded, with_gnss
 
 import smartnav_graph as sn
-from smartnav_graph.summary import peak_memory_mb, versions
+from smartnav_graph.estimate.result.summary import peak_memory_mb, versions
 
 KEYS = {
     *("mode", "duration_s", "path_m", "keyframes", "factors", "chi2_per_dof", "iterations", "converged", "states"),

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.signal import butter, sosfiltfilt
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
-from smartnav_graph.timebase import (
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import (
     NS,
     Gap,
     find_gaps,

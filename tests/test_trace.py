@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph import estimate, trace
-from smartnav_graph.config import Config
-from smartnav_graph.graph import STATES, Block, Step, Tag, key
-from smartnav_graph.losses import robust
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.result import diagnostics
+from smartnav_graph.estimate.run import smooth
+from smartnav_graph.graph.robust import robust
+from smartnav_graph.graph.states import STATES, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.simulation import motions
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.timebase import NS
 
 
 @pytest.fixture(scope="module")
@@ -27,18 +30,18 @@ def session():
 
 @pytest.fixture(scope="module")
 def replayed(session):
-    return estimate.replay(session, Config(replay=ReplayConfig(lag_s=5.0, polish=False)))
+    return replay(session, Config(replay=ReplayConfig(lag_s=5.0, polish=False)))
 
 
 def test_wiring_has_every_factor_in_use_with_the_states_it_touches(session):
-    run = estimate.smooth(session, Config())
-    wiring = run.trace.wiring
-    assert Counter(wiring.sensor.tolist()) == run.summary["factors"]
-    assert set(wiring.letter) <= set(STATES)
-    imu = np.flatnonzero(wiring.sensor == "imu")
+    run = smooth(session, Config())
+    layout = run.trace.layout
+    assert Counter(layout.sensor.tolist()) == run.summary["factors"]
+    assert set(layout.letter) <= set(STATES)
+    imu = np.flatnonzero(layout.sensor == "imu")
     for place, factor in ((1, imu[0]), (7, imu[6])):
-        touched = wiring.factor == factor
-        got = sorted(zip(wiring.letter[touched].tolist(), wiring.index[touched].tolist(), strict=True))
+        touched = layout.factor == factor
+        got = sorted(zip(layout.letter[touched].tolist(), layout.index[touched].tolist(), strict=True))
         assert set(got) >= {(letter, i) for letter in "XV" for i in (place - 1, place)}
     assert run.trace.updates is None and run.trace.pairs is None
     np.testing.assert_array_equal(run.trace.keyframe_ns, run.solution.t_ns)
@@ -86,7 +89,7 @@ def test_clock_offset_is_followed_from_its_prior_to_what_is_found(replayed):
 
 def test_isam2_tells_its_effort_and_a_window_too(session):
     config = Config(replay=ReplayConfig(smoother="isam2", lag_s=5.0, polish=False))
-    updates = estimate.replay(session, config).trace.updates
+    updates = replay(session, config).trace.updates
     assert updates.solved[5:].min() > 0
     assert updates.states == {}  # held there
     assert np.diff(updates.edge).max() < 40
@@ -96,24 +99,26 @@ def test_rows_that_are_let_go_of_are_counted():
     unit = gtsam.noiseModel.Unit.Create(3)
 
     def fix(model):
-        return Tag("gnss", 0, 0), gtsam.GPSFactor(key("X", 0), np.zeros(3), model)
+        return FactorId("gnss", 0, 0), gtsam.GPSFactor(key("X", 0), np.zeros(3), model)
 
     def block(loss, used):
-        return Block("gnss", None, [(key("X", 0),)] * len(used), np.zeros((len(used), 9)), 0, used=used, loss=loss)
+        return FactorBatch(
+            "gnss", None, [(key("X", 0),)] * len(used), np.zeros((len(used), 9)), 0, used=used, loss=loss
+        )
 
-    step = Step(0, 0, 0.0)
-    step.factors = [fix(unit), fix(robust(unit, "cauchy")), fix(robust(unit, "huber"))]
-    step.blocks = [block("cauchy", (True,)), block("none", (True, False)), block("huber", (True,))]
-    assert trace.doubted_rows(step) == 3
+    update = GraphUpdate(0, 0, 0.0)
+    update.factors = [fix(unit), fix(robust(unit, "cauchy")), fix(robust(unit, "huber"))]
+    update.blocks = [block("cauchy", (True,)), block("none", (True, False)), block("huber", (True,))]
+    assert diagnostics.doubted_rows(update) == 3
 
 
 def test_stamps_lie_in_the_window_that_ends_at_their_keyframe():
     keyframes = np.array([10, 20, 30])
-    assert trace.window_of(np.array([0, 10, 11, 20, 29, 31]), keyframes).tolist() == [0, 0, 1, 1, 2, 2]
+    assert diagnostics.window_of(np.array([0, 10, 11, 20, 29, 31]), keyframes).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_no_update_is_told_that_was_not_taken_in_whole():
-    log, step = trace.UpdateLog(), Step(0, 5, 0.0)
+    log, step = diagnostics.UpdateLog(), GraphUpdate(0, 5, 0.0)
     smoother = SimpleNamespace(
         recent=lambda: (np.array([5]), np.zeros((1, 3))), effort=SimpleNamespace(solved=3, relinearised=0)
     )

@@ -12,16 +12,17 @@ from exact import Recording, eight, record, state
 from scipy.stats import chi2
 
 import smartnav_graph as sn
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise
-from smartnav_graph.config import Config
-from smartnav_graph.estimate import solve_passes
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.passes import solve_passes
+from smartnav_graph.estimate.problem import Problem, prepare
+from smartnav_graph.estimate.reweight.imu_noise import MOST, NOISE_NAMES, WIDEST, Component, components
 from smartnav_graph.evaluation.consistency import nees
 from smartnav_graph.factors.imu import CALIBRATED_WEIGHT, CLASS_WEIGHT, ImuBuilder, ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph import Memory, Window
-from smartnav_graph.problem import Problem, prepare
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise, ImuNoise
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.variance import MOST, NOISE_NAMES, WIDEST, Component, components
 
 CLASS = DEVICE_CLASSES["mems"]
 WHITE = GnssNoise(correlated_horizontal_sigma=0.0, correlated_vertical_sigma=0.0)  # a receiver that does not wander
@@ -52,10 +53,10 @@ class Solved:
     problem: Problem
     builder: ImuBuilder
     estimate: Estimate
-    memory: Memory
+    pass_state: PassState
 
     def components(self, windows: Sequence[Window] | None = None) -> Mapping[str, Component]:
-        return components(self.builder, windows or self.problem.windows, self.estimate, self.memory)
+        return components(self.builder, windows or self.problem.windows, self.estimate, self.pass_state)
 
 
 def solved(recording: Recording, config: Config = OFF, weight: float = CLASS_WEIGHT) -> Solved:
@@ -68,8 +69,8 @@ def solved(recording: Recording, config: Config = OFF, weight: float = CLASS_WEI
     sigma_bias = np.array([KNOWN.accel_bias_sigma] * 3 + [KNOWN.gyro_bias_sigma] * 3)
     none = gtsam.imuBias.ConstantBias()
     prior = PriorBuilder(start, np.full(3, 0.1), None, np.full(3, 1.0), sigma_bias, start.nav.velocity(), none)
-    estimate, memory, _ = solve_passes(problem, problem.windows, prior, Memory())
-    return Solved(recording, problem, builder, estimate, memory)
+    estimate, pass_state, _ = solve_passes(problem, problem.windows, prior, PassState())
+    return Solved(recording, problem, builder, estimate, pass_state)
 
 
 # --- one component ----------------------------------------------------------------------------------------------------
@@ -153,8 +154,10 @@ def planted(request) -> tuple[float, list[Solved]]:
 def test_noise_far_from_that_of_the_class_is_found(planted):
     factor, found = planted
     for one in found:
-        assert one.memory.scale("accel") == pytest.approx(factor, rel=0.3)
-        assert one.memory.scale("gyro") == pytest.approx(factor, rel=0.4)  # 30 degrees of freedom, pulled by the class
+        assert one.pass_state.scale("accel") == pytest.approx(factor, rel=0.3)
+        assert one.pass_state.scale("gyro") == pytest.approx(
+            factor, rel=0.4
+        )  # 30 degrees of freedom, pulled by the class
 
 
 def position_nees(found: Sequence[Solved]) -> float:
@@ -179,14 +182,14 @@ def test_and_not_where_it_was_not():
 def test_calibrated_noise_stays_where_it_was_measured():
     found = solved(recorded(), Config(), CALIBRATED_WEIGHT)
     for group in NOISE_NAMES:
-        assert found.memory.scale(group) == pytest.approx(1.0, rel=0.15)
+        assert found.pass_state.scale(group) == pytest.approx(1.0, rel=0.15)
 
 
 def test_fixes_three_times_worse_than_they_say_do_not_swell_the_noise():
     made = recorded(fix_sigma=0.3)
     bold = replace(made.session.gnss, sigma=made.session.gnss.sigma / 3)
     found = solved(replace(made, session=made.session.replace(gnss=bold)), Config())
-    assert found.memory.scale("accel") < 1.3 and found.memory.scale("gyro") < 1.3
+    assert found.pass_state.scale("accel") < 1.3 and found.pass_state.scale("gyro") < 1.3
 
 
 # --- what is told -----------------------------------------------------------------------------------------------------
@@ -214,12 +217,12 @@ def test_a_class_counts_less_than_a_calibration():
 @pytest.mark.parametrize("scales", [{"accel": 3.0}, {"gyro": 0.4}, {"accel": 0.2, "gyro": 5.0}])
 def test_a_window_kept_from_an_earlier_pass_takes_the_noise_of_this_one(scales):
     problem = prepare(recorded(seconds=30.0).session, OFF)
-    window, bias, memory = problem.windows[20], gtsam.imuBias.ConstantBias(), Memory(noise_scales=scales)
+    window, bias, pass_state = problem.windows[20], gtsam.imuBias.ConstantBias(), PassState(noise_scales=scales)
     first, second = (ImuBuilder(CLASS, 9.81) for _ in range(2))
-    kept = first.preintegrate(window, bias, Memory())
-    assert first.preintegrate(window, bias, memory) is kept
-    fresh = second.preintegrate(window, bias, memory).preintMeasCov()
-    covariance = first._factor(window, kept, memory).noiseModel().covariance()
+    kept = first.preintegrate(window, bias, PassState())
+    assert first.preintegrate(window, bias, pass_state) is kept
+    fresh = second.preintegrate(window, bias, pass_state).preintMeasCov()
+    covariance = first._factor(window, kept, pass_state).noiseModel().covariance()
     sigma = np.sqrt(np.diag(fresh))
     np.testing.assert_allclose(covariance / np.outer(sigma, sigma), fresh / np.outer(sigma, sigma), atol=1e-9)
 
@@ -227,7 +230,7 @@ def test_a_window_kept_from_an_earlier_pass_takes_the_noise_of_this_one(scales):
 def test_a_window_is_preintegrated_anew_where_its_bias_has_moved():
     window = prepare(recorded(seconds=30.0).session, OFF).windows[20]
     builder, bias = ImuBuilder(CLASS, 9.81), gtsam.imuBias.ConstantBias()
-    kept = builder.preintegrate(window, bias, Memory())
+    kept = builder.preintegrate(window, bias, PassState())
     near, far = (gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, step])) for step in (5e-5, 5e-3))
-    assert builder.preintegrate(window, near, Memory()) is kept
-    assert builder.preintegrate(window, far, Memory()) is not kept
+    assert builder.preintegrate(window, near, PassState()) is kept
+    assert builder.preintegrate(window, far, PassState()) is not kept

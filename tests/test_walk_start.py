@@ -7,17 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import StepNoise
-from smartnav_graph.frames import body_R_vehicle, wrap_deg
-from smartnav_graph.graph import Window
-from smartnav_graph.keyframes import KeyframeConfig, keyframe_times, make_windows
+from smartnav_graph.core import frames
+from smartnav_graph.core.frames import body_R_vehicle, wrap_deg
+from smartnav_graph.core.timebase import interpolate
+from smartnav_graph.estimate.alignment.pedestrian import Walk, walked
+from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import StepNoise
+from smartnav_graph.session.detect.steps import Steps, find_steps
+from smartnav_graph.session.streams import ControlPoint
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.scenarios import Scenario
-from smartnav_graph.steps import Steps, find_steps
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import interpolate
-from smartnav_graph.walk_start import Walk, walked
 
 PHONE = body_R_vehicle("+y", "+z")
 BIAS = np.array([0.01, -0.02, 0.05])  # rad/s, 3 deg a second about the vertical

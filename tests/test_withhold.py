@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.streams import GnssFix
-from smartnav_graph.timebase import NS, ns_from_seconds
-from smartnav_graph.withhold import EXPECTED, Withhold, split
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.session.holdout import EXPECTED, Withhold, split
+from smartnav_graph.session.streams import GnssFix
 
 
 @pytest.fixture(scope="module")

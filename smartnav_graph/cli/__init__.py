@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from smartnav_graph.errors import SmartnavError
+from smartnav_graph.core.errors import SmartnavError
 
 if TYPE_CHECKING:
     from smartnav_graph.cli.options import Command

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from smartnav_graph import estimate, readers
-from smartnav_graph import session as session_model
+from smartnav_graph import readers
 from smartnav_graph.cli.options import Command, OutPath
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text, withheld_lines
-from smartnav_graph.config import Config, RunConfig
-from smartnav_graph.errors import SessionError
-from smartnav_graph.run_folder import write_run
-from smartnav_graph.session import Session
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.run import smooth
+from smartnav_graph.output.run_folder import write_run
+from smartnav_graph.session import session as session_model
+from smartnav_graph.session.session import Session
 
 MARK = ".smartnav-demo"
 KEPT = "gnss:every=10"
@@ -47,7 +48,7 @@ class Demo(Command):
 
     def _smooth(self, session: Session, config: Config, out: Path, *, brief: bool = False) -> None:
         with progress(self.quiet) as show:
-            run = estimate.smooth(session, config, progress=show)
+            run = smooth(session, config, progress=show)
             summary = write_run(run, out, force=True, progress=show)
         print_findings("\n".join(withheld_lines(summary)) if brief else run_text(summary, out))
 

@@ -11,8 +11,8 @@ import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.files import refuse_existing
-from smartnav_graph.run_folder import plain, read_run
+from smartnav_graph.core.files import refuse_existing
+from smartnav_graph.output.run_folder import plain, read_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Explain(Command):
     """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
-        from smartnav_graph.explain import explain
+        from smartnav_graph.output.explain import explain
 
         with progress(self.quiet) as show:
             show(f"looking into {self.run_path}", 0, 0)
@@ -59,7 +59,7 @@ class Compare(Command):
     """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
-        from smartnav_graph.differences import compare_runs
+        from smartnav_graph.output.run_comparison import compare_runs
 
         if self.out is not None:
             refuse_existing(self.out, self.force)

@@ -14,12 +14,12 @@ import tyro
 from smartnav_graph import readers
 from smartnav_graph.cli.options import Asking, Switch, repairs
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.intervals import FixesFromReference, Interval, intervals
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.evaluation.intervals import FixesFromReference, Interval, intervals
+from smartnav_graph.output.run_folder import plain
 from smartnav_graph.readers.reference import load_reference
-from smartnav_graph.run_folder import plain
-from smartnav_graph.session import Session
-from smartnav_graph.streams import Reference
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Reference
 
 
 @dataclass(frozen=True, kw_only=True)

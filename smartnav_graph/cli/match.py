@@ -12,17 +12,17 @@ import numpy as np
 import tyro
 
 from smartnav_graph import readers
-from smartnav_graph import session as session_model
-from smartnav_graph.calibration.camera import Camera
 from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.errors import CalibrationError, ConfigError, SessionError
+from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
+from smartnav_graph.output.run_folder import plain, read_run
 from smartnav_graph.readers.reference import load_reference
-from smartnav_graph.run_folder import plain, read_run
-from smartnav_graph.session import Session
+from smartnav_graph.session import session as session_model
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Session
 from smartnav_graph.vision import benchmark as scores
 from smartnav_graph.vision import features as kinds
-from smartnav_graph.vision import kept, match_file
+from smartnav_graph.vision import match_file, match_store
 from smartnav_graph.vision.benchmark import Published, Score
 from smartnav_graph.vision.front_end import FrontEndConfig
 from smartnav_graph.vision.map import SOURCE, Known, own_fixes, pose_fixes
@@ -102,7 +102,7 @@ class Match(Command):
     def _match(self) -> None:
         config = self._config(self.features or "orb", "1,2,4,8", self.rate)
         with progress(self.quiet) as show:
-            found = kept.match(self.session, config, force=self.force, workers=self.workers, progress=show)
+            found = match_store.match(self.session, config, force=self.force, workers=self.workers, progress=show)
         if self.json:
             self._print_json({"computed": found.computed} | asdict(found.report))
             return
@@ -126,13 +126,13 @@ class Match(Command):
     def _from_file(self, path: Path) -> None:
         folder = Path(self.session)
         session = session_model.load(folder)
-        kept.refuse_others(folder, "matches", self.force)
+        match_store.refuse_others(folder, "matches", self.force)
         name, camera = self._one_camera(session)
         rows = match_file.read(path)
         assert session.images is not None  # the camera took some
         matches, lost = match_file.to_matches(rows, session.images, name, camera)
         report = {"from_file": str(path), "rows": len(rows.t0_ns), "matches": len(matches), "rows_without_images": lost}
-        kept.keep(folder, matches, {"from_file": path.name, "camera": name}, report)
+        match_store.keep(folder, matches, {"from_file": path.name, "camera": name}, report)
         if self.json:
             self._print_json(report)
             return
@@ -155,13 +155,13 @@ class Match(Command):
     def _map(self, path: Path) -> None:
         folder = Path(self.session)
         session = session_model.load(folder)
-        kept.refuse_others(folder, "pose_fixes", self.force)
+        match_store.refuse_others(folder, "pose_fixes", self.force)
         refuse_foreign_fixes(folder, session)
         known = own_fixes(session) if self.known is None else self._known(self.known, session)
         found = pose_fixes(path, session, known)
         told = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": found.similarity.sigma}
         told["turn_sigma_deg"] = float(np.degrees(found.similarity.turn_sigma).max())
-        kept.keep(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
+        match_store.keep(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
         if self.json:
             self._print_json(told)
             return

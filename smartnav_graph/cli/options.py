@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, Self
 
 import tyro
 
-from smartnav_graph import config as config_model
-from smartnav_graph import repair as repair_model
-from smartnav_graph.config import Config
+from smartnav_graph.estimate import config as config_model
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.session import repair as repair_model
 
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 Text = str | None

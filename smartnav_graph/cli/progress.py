@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from smartnav_graph.progress import Progress, silent
+from smartnav_graph.core.progress import Progress, silent
 
 # Seconds between two drawings of the bar.
 PERIOD_S = 0.1

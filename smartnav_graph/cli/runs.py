@@ -10,16 +10,18 @@ from typing import Annotated, Literal
 
 import tyro
 
-from smartnav_graph import estimate, readers
-from smartnav_graph.calibration import model as calibration_model
+from smartnav_graph import readers
 from smartnav_graph.cli.options import Estimating, RunPath, Writing, given, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text
-from smartnav_graph.config import Config
-from smartnav_graph.errors import SessionError, SmartnavError
+from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.estimate.run import Run, smooth
 from smartnav_graph.evaluation import Evaluation, evaluate
-from smartnav_graph.export import export, export_pictures
-from smartnav_graph.run_folder import StoredRun, check_out, read_run, write_run
+from smartnav_graph.output.export import export, export_pictures
+from smartnav_graph.output.run_folder import StoredRun, check_out, read_run, write_run
+from smartnav_graph.session.calibration import model as calibration_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +66,7 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
         begin = time.perf_counter()
         session = readers.load(command.session, repairs=repairs(command.repair))
         load_s = time.perf_counter() - begin
-        run = (estimate.replay if causal else estimate.smooth)(session, config, progress=show)
+        run = (replay if causal else smooth)(session, config, progress=show)
         evaluation = against_own_reference(run)
         summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s, progress=show)
     if "interrupted" in summary["mode"] and not command.quiet:
@@ -72,7 +74,7 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
     print_findings(run_text(summary, command.out))
 
 
-def against_own_reference(run: estimate.Run) -> Evaluation | None:
+def against_own_reference(run: Run) -> Evaluation | None:
     """The comparison with the session's own reference, where it has one on the same clock."""
     if run.session.reference is None:
         return None

@@ -12,10 +12,10 @@ import tyro
 from smartnav_graph.cli.options import Command, RunPath, Switch
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import statistics_line
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.evaluation import Evaluation, evaluate
+from smartnav_graph.output.run_folder import plain, read_run
 from smartnav_graph.readers.reference import load_reference
-from smartnav_graph.run_folder import plain, read_run
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from smartnav_graph import session as session_model
 from smartnav_graph.cli.options import Command, Repairs, SourceName, Switch, Text, Writing, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
-from smartnav_graph.files import refuse_existing, refuse_foreign
+from smartnav_graph.core.files import refuse_existing, refuse_foreign
+from smartnav_graph.session import session as session_model
 
 HEADER = "session.toml"
 
@@ -70,7 +70,8 @@ class Info(Command):
     """Repairs of faulty rows: nan, order, stamps."""
 
     def run(self) -> None:
-        from smartnav_graph import health, readers
+        from smartnav_graph import readers
+        from smartnav_graph.session import health
 
         with progress(self.quiet) as show:
             show(f"reading {self.session}", 0, 0)
@@ -170,7 +171,7 @@ class View(Command):
     """In a browser instead of a window."""
 
     def run(self) -> None:
-        from smartnav_graph.rerun_log import view
+        from smartnav_graph.output.rerun_log import view
 
         view(self.paths, self.web)
 

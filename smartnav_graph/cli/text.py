@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smartnav_graph.session import Session
+from smartnav_graph.session.session import Session
 
 STYLES = {"error:": "bold red", "warning:": "yellow", "missing:": "cyan"}
 

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.solution import POS, ROT, VEL, Solution
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS, interpolate, seconds_since
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, interpolate, seconds_since
+from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.session.streams import Reference
 
 METHODS = ("none", "yaw", "se3", "sim3")
 

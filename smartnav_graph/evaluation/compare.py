@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import interpolate, seconds_since
 from smartnav_graph.evaluation.align import Track, track_of_solution
 from smartnav_graph.evaluation.metrics import Statistics
-from smartnav_graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Solution
-from smartnav_graph.timebase import interpolate, seconds_since
+from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Solution
 
-Floats = NDArray[np.float64]
 DEG = float(np.degrees(1.0))
 
 

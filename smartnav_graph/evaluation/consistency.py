@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:

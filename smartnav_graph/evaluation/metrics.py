@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.align import (
     METHODS,
     Alignment,
@@ -25,11 +27,8 @@ from smartnav_graph.evaluation.align import (
     track_of_solution,
 )
 from smartnav_graph.evaluation.consistency import nees
-from smartnav_graph.solution import POS, ROT, VEL, Solution
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.session.streams import Reference
 
 
 @dataclass(frozen=True)

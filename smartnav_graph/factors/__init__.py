@@ -12,16 +12,16 @@ from smartnav_graph.factors import (
     gravity,
     imu,
     magnetometer,
+    pedestrian,
     pose_fix,
     smart,
     standstill,
-    step,
     vehicle,
     velocity,
     wheel,
 )
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.graph import Builder
+from smartnav_graph.graph.update import Builder
 
 # The inertial builder comes first: it predicts the state that the others refer to.
 BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
@@ -38,7 +38,7 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "magnetometer": magnetometer.build,
     "gravity": gravity.build,
     "barometer": barometer.build,
-    "steps": step.build,
+    "steps": pedestrian.build,
     "coplanarity": coplanarity.build,
     "smart": smart.build,
 }

@@ -19,16 +19,18 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smartnav_graph.calibration.model import BarometerNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe
-from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
-from smartnav_graph.losses import check_loss
-from smartnav_graph.streams import Barometer
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.robust import check_loss
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import BarometerNoise
+from smartnav_graph.session.streams import Barometer
 
 SEA_LEVEL_HPA = 1013.25
 SEA_LEVEL_K, LAPSE_K_M, EXPONENT = 288.15, 0.0065, 5.25588
@@ -104,25 +106,25 @@ class BarometerBuilder:
     stage: int = 0
     _start: float = 0.0
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The bias at the keyframe, tied to the one before, and the mean height around the keyframe."""
         bias = key("D", window.index)
         measured = self._around(window)
-        if previous is None and measured is not None and step.predicted is not None:
-            self._start = measured[0] - float(step.predicted.position()[2])
-        step.chain[bias] = np.array([self._start])
-        tag = Tag("barometer_bias", window.t1_ns)
+        if previous is None and measured is not None and update.predicted is not None:
+            self._start = measured[0] - float(update.predicted.position()[2])
+        update.chain[bias] = np.array([self._start])
+        tag = FactorId("barometer_bias", window.t1_ns)
         if previous is None:
             model = gtsam.noiseModel.Isotropic.Sigma(1, self.bias_sigma)
-            step.add(tag, gtsam.PriorFactorVector(bias, np.zeros(1), model))
+            update.add(tag, gtsam.PriorFactorVector(bias, np.zeros(1), model))
         else:
             walk = self.scale * self.noise.pressure_walk * np.sqrt(window.length_s)
             model = gtsam.noiseModel.Isotropic.Sigma(1, walk)
-            step.add(tag, gtsam.BetweenFactorVector(key("D", window.index - 1), bias, np.zeros(1), model))
+            update.add(tag, gtsam.BetweenFactorVector(key("D", window.index - 1), bias, np.zeros(1), model))
         if measured is not None:
             keys = (key("X", window.index), key("V", window.index), bias)
             data = np.array([measured])
-            step.blocks.append(Block(self.name, MODEL, [keys], data, window.t1_ns, loss=self.loss))
+            update.blocks.append(FactorBatch(self.name, MODEL, [keys], data, window.t1_ns, loss=self.loss))
 
     def _around(self, window: Window) -> tuple[float, float, float] | None:
         """Mean height m, how long after the keyframe it stands s, and its sigma m."""

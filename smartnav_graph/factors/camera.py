@@ -8,19 +8,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.so3 import exp, rotate
+from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanar_rows import Rig
 from smartnav_graph.factors.gnss import clock_state
-from smartnav_graph.factors.observation import exp, turned
-from smartnav_graph.graph import SessionState
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, seconds_since
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
+from smartnav_graph.graph.states import SessionState
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Imu
 
 # States of the camera belong to this stream; the name of its correction in the body.
 STREAM = "images"
@@ -80,7 +77,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Eye:
+class CameraModel:
     """The camera of a session as its factors take it.
 
     camera : its calibration, or what stands in for one; readout_s : from its first row to its last, zero where rows
@@ -118,17 +115,17 @@ class Eye:
     def velocity(self, motion: Motion, rate: Floats) -> Floats:
         """Of the camera (k, 3) m/s in nav axes, from that of the body and its rate (k, 3) rad/s."""
         around = np.cross(rate, self.rig.body_t_cam)
-        return motion.nav_v_body + turned(motion.nav_R_body, around)
+        return motion.nav_v_body + rotate(motion.nav_R_body, around)
 
 
 def seen_from(xy_n: Floats, turn: Floats) -> Floats:
     """Points (m, 2) that a camera saw after it had turned by rotation vectors (m, 3), as it would have seen them
     before, had it only turned."""
-    ray = turned(exp(turn), np.column_stack([xy_n, np.ones(len(xy_n))]))
+    ray = rotate(exp(turn), np.column_stack([xy_n, np.ones(len(xy_n))]))
     return np.asarray(ray[:, :2] / ray[:, 2:])
 
 
-def eye_of(context: FactorContext, config: Any) -> Eye:
+def make_camera_model(context: FactorContext, config: Any) -> CameraModel:
     """The camera of a session; `config` is the coplanarity's, which has the options of the camera."""
     camera = context.camera or UNKNOWN_CAMERA
     mount = context.session.mount(context.camera_name)
@@ -141,7 +138,7 @@ def eye_of(context: FactorContext, config: Any) -> Eye:
         timed=seconds > 0,
     )
     readout = _readout_s(context) if config.row_time else 0.0
-    return Eye(camera, rig, readout, float(np.radians(degrees)), seconds)
+    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds)
 
 
 def _readout_s(context: FactorContext) -> float:

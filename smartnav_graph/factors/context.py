@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.factors import bridging
-from smartnav_graph.factors.bridging import Bridge
-from smartnav_graph.session import Session
-from smartnav_graph.standstill import Standstills
-from smartnav_graph.timebase import NS, Gap
+from smartnav_graph.core.timebase import NS, Gap
+from smartnav_graph.factors import gap_model
+from smartnav_graph.factors.gap_model import Bridge
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.detect.standstills import Standstills
+from smartnav_graph.session.session import Session
 from smartnav_graph.vision.pairs import Pairs
 
 
@@ -39,7 +39,7 @@ class FactorContext:
     def bridges(self) -> Mapping[int, Bridge]:
         """The bridge of every gap, by its start stamp."""
         noise = self.calibration.imu_noise
-        return bridging.bridges(self.session.require_imu(), self.gaps, noise, causal=self.causal)
+        return gap_model.bridges(self.session.require_imu(), self.gaps, noise, causal=self.causal)
 
     @cached_property
     def camera_name(self) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from smartnav_graph.calibration.model import GnssNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder
+from smartnav_graph.session.calibration.model import GnssNoise
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.factors.observation import exp, right_jacobian, skew, turned
-from smartnav_graph.graph import Measured
-from smartnav_graph.losses import loss_weights
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.so3 import exp, right_jacobian, rotate, skew
+from smartnav_graph.graph.robust import loss_weights
+from smartnav_graph.graph.update import Measured
 from smartnav_graph.vision.epipolar import Sampson, cross, essential, rays, sampson
 from smartnav_graph.vision.pairs import Pairs
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Baselines (m) far below this say nothing: the speed of a hand that holds still, over a second.
 BASELINE_FLOOR_M = 1e-3
@@ -123,8 +121,8 @@ def _between(
     back, lever = C.transpose(0, 2, 1), rig.body_t_cam
     Ri, Rj = first[:, :3, :3], second[:, :3, :3]
     D = Ri.transpose(0, 2, 1) @ Rj
-    m = turned(Ri.transpose(0, 2, 1), second[:, :3, 3] - first[:, :3, 3]) + D @ lever
-    R, t = back @ D @ C, turned(back, m - lever)
+    m = rotate(Ri.transpose(0, 2, 1), second[:, :3, 3] - first[:, :3, 3]) + D @ lever
+    R, t = back @ D @ C, rotate(back, m - lever)
     by_first, by_second, by_a = (np.zeros((len(first), 6, n)) for n in (6, 6, 3))
     by_first[:, :3, :3] = -(D @ C).transpose(0, 2, 1)
     by_first[:, 3:, :3] = back @ skew(m)
@@ -166,7 +164,7 @@ class Matched:
         return sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M, shift)
 
     def measured(self, states: Sequence[Floats], data: Floats) -> Measured:
-        """The matches of the rows one by one; see `whole_graph.Stack.measured`."""
+        """The matches of the rows one by one; see `whole_graph.StackedFactors.measured`."""
         rows = data[:, 0].astype(np.intp)
         found = self.missed(relative(self.rig, states, data), rows)
         white = (found.residual / self.sigma)[self.there[rows]]
@@ -240,11 +238,11 @@ class CompressedRows(Matched):
         there = relative(self.rig, states, data)
         e, by_e = _vectorised(there.R, there.t)
         N, root = self.length[rows], self.root[rows]
-        Ne = turned(N, e)
+        Ne = rotate(N, e)
         square = (e * Ne).sum(axis=1) + self.floor[rows]  # nothing where no match is in use
         s = np.sqrt(np.where(square > 0, square, 1.0))[:, None]
         at_e, constant = root[:, :, :9], root[:, :, 9:].sum(axis=2)
-        r = (turned(at_e, e) + constant) / (self.sigma * s)
+        r = (rotate(at_e, e) + constant) / (self.sigma * s)
         by = at_e / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
         return r, [by @ by_e @ jacobian for jacobian in there.by]
 

@@ -16,19 +16,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors.camera import BodyRates, Eye, Motion, eye_of, seen_from
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp, rotate
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.factors.camera import BodyRates, CameraModel, Motion, make_camera_model, seen_from
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
-from smartnav_graph.factors.observation import exp, turned
-from smartnav_graph.graph import Block, Memory, RowModel, State, Step, Window, key
-from smartnav_graph.session import Session
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.session import Session
 from smartnav_graph.vision.gating import gate
 from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # How sure the turn between two images is, rad and rad/s: what is left of the gyro's bias and noise.
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
@@ -36,7 +37,8 @@ TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
 SMART = "smart"
 # Share of its matches that a pair must keep.
 LEAST_SHARE = 0.5
-# Passes until matches are settled (`Memory.settled`): by the turn, at states found with images, again and compressed.
+# Passes until matches are settled (`PassState.settled`): by the rotation,
+# at states found with images, again and compressed.
 COMPRESSED = 3
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
@@ -96,7 +98,7 @@ class CoplanarityBuilder:
     seen: Pairs
     image_ns: NDArray[np.int64]
     rates: BodyRates
-    eye: Eye
+    camera_model: CameraModel
     sigma: float
     merge_ns: int
     config: CoplanarityConfig = field(default_factory=CoplanarityConfig)
@@ -123,33 +125,33 @@ class CoplanarityBuilder:
     @property
     def rig(self) -> Rig:
         """The camera in the body."""
-        return self.eye.rig
+        return self.camera_model.rig
 
     # --- one window ---
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The pairs whose second image stands at the window's end."""
         if previous is None:
             self._begin()
-        elif memory.phase == "causal":
+        elif pass_state.phase == "causal":
             self._go_on(window, previous)
         image = self._image_at(window.t1_ns)
         if image is None:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
         ending = self._ending(image)
-        if memory.phase == "causal":
-            self._look_now(image, step)
-            self._judge_now(self._model(memory), ending)
-        self._add_pairs(step, ending, memory)
+        if pass_state.phase == "causal":
+            self._look_now(image, update)
+            self._judge_now(self._model(pass_state), ending)
+        self._add_pairs(update, ending, pass_state)
 
-    def renew(self, step: Step, memory: Memory) -> None:
+    def renew(self, update: GraphUpdate, pass_state: PassState) -> None:
         """The pairs of a step once more, as what was learnt since has them."""
-        image = self._image_at(step.t_ns)
+        image = self._image_at(update.t_ns)
         if image is not None:
-            step.blocks = [block for block in step.blocks if block.sensor != self.name]
-            self._add_pairs(step, self._ending(image), memory)
-            step.hold(memory.held)
+            update.blocks = [block for block in update.blocks if block.sensor != self.name]
+            self._add_pairs(update, self._ending(image), pass_state)
+            update.hold(pass_state.held)
 
     def _ending(self, image: int) -> NDArray[np.intp]:
         """Pairs whose second image this is, and whose first one has a keyframe."""
@@ -158,32 +160,34 @@ class CoplanarityBuilder:
             [k for k in range(first, last) if int(self.pairs.images[k, 0]) in self._keyframe], dtype=np.intp
         )
 
-    def _add_pairs(self, step: Step, ending: NDArray[np.intp], memory: Memory) -> None:
-        if self.replaced(memory):
+    def _add_pairs(self, update: GraphUpdate, ending: NDArray[np.intp], pass_state: PassState) -> None:
+        if self.replaced(pass_state):
             return
-        verdict = self.verdict_of(memory)
+        verdict = self.verdict_of(pass_state)
         ending = ending[(verdict[ending] == IN_USE) | (verdict[ending] == CONTRARY)]
         if not len(ending):
             return
-        model, used = self._model(memory), tuple((verdict[ending] == IN_USE).tolist())
-        states = self.eye.states()
+        model, used = self._model(pass_state), tuple((verdict[ending] == IN_USE).tolist())
+        states = self.camera_model.states()
         keys, data = [], np.empty((len(ending), COLUMNS))
         for row, pair in enumerate(ending):
             images = [int(i) for i in self.pairs.images[pair]]
             own = iter([key("X", self._keyframe[i]) for i in images])
             speed = iter([key("V", self._keyframe[i]) for i in images])
             of = {"X": own, "V": speed}
-            keys.append(tuple(next(of[a]) if a in of else step.use(states[a]) for a in self.rig.letters))
+            keys.append(tuple(next(of[a]) if a in of else update.use(states[a]) for a in self.rig.letters))
             data[row] = [pair, *self.rate[images].ravel()]
-        step.blocks.append(Block(self.name, model, keys, data, step.t_ns, rows=tuple(ending.tolist()), used=used))
+        update.blocks.append(
+            FactorBatch(self.name, model, keys, data, update.t_ns, rows=tuple(ending.tolist()), used=used)
+        )
 
-    def replaced(self, memory: Memory) -> bool:
+    def replaced(self, pass_state: PassState) -> bool:
         """Whether tracks stand in for the pairs in a pass with this memory."""
-        return memory.settled.get(SMART, 0) > 0 and memory.phase != "causal"
+        return pass_state.settled.get(SMART, 0) > 0 and pass_state.phase != "causal"
 
-    def verdict_of(self, memory: Memory) -> NDArray[np.intp]:
+    def verdict_of(self, pass_state: PassState) -> NDArray[np.intp]:
         """What became of each pair (n,) in a pass with this memory."""
-        return self.verdict if memory.settled.get(self.name) else self.at_once
+        return self.verdict if pass_state.settled.get(self.name) else self.at_once
 
     def _begin(self) -> None:
         """Forget the pass before."""
@@ -200,24 +204,29 @@ class CoplanarityBuilder:
         found = near < len(self.image_ns) and abs(int(self.image_ns[near]) - t_ns) <= self.merge_ns
         return near if found else None
 
-    def _model(self, memory: Memory) -> RowModel:
+    def _model(self, pass_state: PassState) -> RowModel:
         """The row model of a pass: made anew where what was learnt changed."""
-        learnt = memory.rejected.get("matches"), memory.settled.get(self.name, 0), memory.scale(self.name), memory.phase
+        learnt = (
+            pass_state.rejected.get("matches"),
+            pass_state.settled.get(self.name, 0),
+            pass_state.scale(self.name),
+            pass_state.phase,
+        )
         if self._made is None or self._made[0] != learnt:
-            self._made = (learnt, self._new_model(memory))
+            self._made = (learnt, self._new_model(pass_state))
         return self._made[1]
 
-    def _new_model(self, memory: Memory) -> RowModel:
-        sigma = self.sigma * memory.scale(self.name)
-        if memory.phase == "causal":
+    def _new_model(self, pass_state: PassState) -> RowModel:
+        sigma = self.sigma * pass_state.scale(self.name)
+        if pass_state.phase == "causal":
             return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), self.config.reach)
-        use, settled = self._padded_use(memory), memory.settled.get(self.name, 0)
+        use, settled = self._padded_use(pass_state), pass_state.settled.get(self.name, 0)
         if settled == COMPRESSED and self.frozen is not None and self.config.compress:
             return CompressedRows(self.pairs, self.rig, sigma, use, self.config.reach, self.frozen)
         return PairRows(self.pairs, self.rig, sigma, use, self.config.reach)
 
-    def _padded_use(self, memory: Memory) -> Mask:
-        use = memory.used("matches", np.arange(len(self.pairs.pair)))
+    def _padded_use(self, pass_state: PassState) -> Mask:
+        use = pass_state.used("matches", np.arange(len(self.pairs.pair)))
         return np.asarray(self.pairs.padded(use), dtype=bool)
 
     # --- when rows were seen ---
@@ -228,12 +237,12 @@ class CoplanarityBuilder:
         self.motion = motion
         self.pairs = self._at_once(self.seen, offset_s)
 
-    def _look_now(self, image: int, step: Step) -> None:
+    def _look_now(self, image: int, update: GraphUpdate) -> None:
         """The same at one image of a replay, by what is foretold there."""
-        motion, bias = self.motion, step.bias.gyroscope()
+        motion, bias = self.motion, update.bias.gyroscope()
         self.rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
-        motion.nav_R_body[image] = step.predicted.attitude().matrix()
-        motion.nav_v_body[image], motion.gyro_bias[image] = step.predicted.velocity(), bias
+        motion.nav_R_body[image] = update.predicted.attitude().matrix()
+        motion.nav_v_body[image], motion.gyro_bias[image] = update.predicted.velocity(), bias
 
     def _at_once(self, pairs: Pairs, offset_s: float) -> Pairs:
         """Pairs as they would be had all rows of an image been read at once with its first.
@@ -241,23 +250,23 @@ class CoplanarityBuilder:
         A ray seen d later turns with the camera, x' ~ Exp(w d) x~, and its camera has gone on by v d: pairs whose rows
         lie at d0, d1 have a baseline of t + c0_R_nav (v1 d1 - v0 d0).
         """
-        if self.eye.readout_s == 0:
+        if self.camera_model.readout_s == 0:
             return pairs
         stamps, motion = self.image_ns + round(offset_s * NS), self.motion
-        speed = self.eye.velocity(motion, self.rate)
+        speed = self.camera_model.velocity(motion, self.rate)
         xy, way = [], []
         for x, place in zip((pairs.x0, pairs.x1), pairs.images[pairs.pair].T, strict=True):
-            delay = self.eye.delay(x)
-            xy.append(seen_from(x, self.eye.turns(self.rates, stamps[place], delay, motion.gyro_bias[place])))
+            delay = self.camera_model.delay(x)
+            xy.append(seen_from(x, self.camera_model.turns(self.rates, stamps[place], delay, motion.gyro_bias[place])))
             way.append(speed[place] * delay[:, None])
         first = motion.nav_R_body[pairs.images[pairs.pair, 0]] @ self.rig.body_R_cam
-        return replace(pairs, x0=xy[0], x1=xy[1], shift=turned(first.transpose(0, 2, 1), way[1] - way[0]))
+        return replace(pairs, x0=xy[0], x1=xy[1], shift=rotate(first.transpose(0, 2, 1), way[1] - way[0]))
 
     # --- which matches ---
 
-    def used_matches(self, memory: Memory) -> Mask:
+    def used_matches(self, pass_state: PassState) -> Mask:
         """Mask (m,) of the matches in use in a pass with this memory."""
-        model = self._model(memory)
+        model = self._model(pass_state)
         assert isinstance(model, Matched)
         return np.asarray(self.pairs.flat(model.use), dtype=bool)
 
@@ -304,13 +313,13 @@ def build(context: FactorContext) -> CoplanarityBuilder | None:
     pairs, config = context.pairs, context.config.coplanarity
     if pairs is None or not len(pairs) or not config.enabled:
         return None
-    eye = eye_of(context, config)
+    camera_model = make_camera_model(context, config)
     return CoplanarityBuilder(
         pairs,
         context.image_ns,
         BodyRates(context.session.require_imu()),
-        eye,
-        sigma=eye.camera.noise,
+        camera_model,
+        sigma=camera_model.camera.noise,
         merge_ns=round(context.config.keyframes.merge_s * NS),
         config=config,
     )

@@ -16,18 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smartnav_graph.calibration.model import GnssNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.correlated import add_wander, wander_sigma
-from smartnav_graph.factors.observation import Partial, here, preintegrated, row_model, skew, turned
-from smartnav_graph.frames import STANDARD_GRAVITY
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Tag, Window, key
-from smartnav_graph.losses import check_loss, robust
-from smartnav_graph.session import Session
-from smartnav_graph.streams import Positioned
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.gauss_markov import add_wander, wander_sigma
+from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.robust import check_loss, robust
+from smartnav_graph.graph.states import SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate, RowModel
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Positioned
 
 LEAST_WANDERING_SIGMA = 0.5  # m
 
@@ -81,7 +84,7 @@ class PositionFix:
         states = dict(zip(self.extra, extra, strict=True))
         lever = data[:, 3:6] + states.get("L", 0.0)
         weight = 1.0 / data[:, 6:9, None]
-        residual = (p + turned(R, lever) + states.get("C", 0.0) - data[:, :3]) * weight[:, :, 0]
+        residual = (p + rotate(R, lever) + states.get("C", 0.0) - data[:, :3]) * weight[:, :, 0]
         by_state = np.zeros((len(p), 3, 9))
         by_state[:, :, :3] = -R @ skew(lever) * weight
         by_state[:, :, 3:6] = np.eye(3) * weight
@@ -150,15 +153,15 @@ class PositionBuilder:
         position, sigma = session.nav_position(stream), fix_sigmas(stream, noise)
         return cls(name, position, sigma, own, lever, config, noise, session.gravity)
 
-    def wanders(self, memory: Memory) -> bool:
+    def wanders(self, pass_state: PassState) -> bool:
         """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
         `LEAST_WANDERING_SIGMA`. Better ones come from carrier phase, whose errors do not wander by metres."""
-        typical = float(np.median(self.scaled_sigma(memory)[:, :2]))
+        typical = float(np.median(self.scaled_sigma(pass_state)[:, :2]))
         return self.noise.wanders and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
 
-    def scaled_sigma(self, memory: Memory) -> Floats:
+    def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scale of this sensor."""
-        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * memory.scale(self.name))
+        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * pass_state.scale(self.name))
 
     def gate(
         self, square: Floats, level: float, rows: NDArray[np.intp], probability: float | None = None
@@ -180,15 +183,15 @@ class PositionBuilder:
         """Whether outliers are looked for."""
         return self.config.loss in ("gate", "gnc")
 
-    def _loss_of(self, row: int, sigma: Floats, step: Step, memory: Memory) -> str:
-        """Loss of one fix in the phase at hand; see `Memory`."""
+    def _loss_of(self, row: int, sigma: Floats, update: GraphUpdate, pass_state: PassState) -> str:
+        """Loss of one fix in the phase at hand; see `PassState`."""
         if not self.gated:
             return self.config.loss
-        if memory.phase != "causal" or step.variance is None:
-            return "cauchy" if memory.phase == "robust" else "none"
-        foretold = step.predicted.position() + step.predicted.attitude().matrix() @ self.lever[row]
-        wander = wander_sigma(self.noise) ** 2 if self.name in memory.correlated else 0.0
-        square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + step.variance + wander)).sum())
+        if pass_state.phase != "causal" or update.variance is None:
+            return "cauchy" if pass_state.phase == "robust" else "none"
+        foretold = update.predicted.position() + update.predicted.attitude().matrix() @ self.lever[row]
+        wander = wander_sigma(self.noise) ** 2 if self.name in pass_state.correlated else 0.0
+        square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + update.variance + wander)).sum())
         return "cauchy" if self._surprises(square, row) else "none"
 
     def _surprises(self, square: float, row: int) -> bool:
@@ -199,13 +202,13 @@ class PositionBuilder:
         known.append(square)
         return bool(self.gate(np.array([square]), level, np.array([row]))[0])
 
-    def grows(self, memory: Memory) -> bool:
+    def grows(self, pass_state: PassState) -> bool:
         """Whether there is more to these fixes once the trajectory is found: states of their own."""
-        return bool(self._states(replace(memory, stage=LAST_STAGE))) or self.wanders(memory)
+        return bool(self._states(replace(pass_state, stage=LAST_STAGE))) or self.wanders(pass_state)
 
-    def _states(self, memory: Memory) -> dict[str, SessionState]:
+    def _states(self, pass_state: PassState) -> dict[str, SessionState]:
         """Session states in use, by letter."""
-        if memory.stage < LAST_STAGE:
+        if pass_state.stage < LAST_STAGE:
             return {}
         clock, lever = self.config.time_offset_sigma, self.config.lever_arm_sigma
         found = {}
@@ -216,18 +219,18 @@ class PositionBuilder:
             found["L"] = SessionState("L", self.name, name, np.zeros(3), np.full(3, lever))
         return found
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A factor for every row of this stream that became known in the window."""
-        wanders = self.name in memory.correlated
+        wanders = self.name in pass_state.correlated
         if wanders:
-            add_wander(step, window, previous, self.noise)
-        states = self._states(memory)
+            add_wander(update, window, previous, self.noise)
+        states = self._states(pass_state)
         for row in window.rows.get(self.name, ()):
-            self._add_row(step, int(row), memory, states, self._at_keyframe(step, window, states))
+            self._add_row(update, int(row), pass_state, states, self._at_keyframe(update, window, states))
         for late in window.late.get(self.name, ()):
             assert previous is not None
             partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
-            self._add_row(step, late.row, memory, states, (late.window.index - 1, partial))
+            self._add_row(update, late.row, pass_state, states, (late.window.index - 1, partial))
 
     def force(self, window: Window, nav_R_body: Floats, bias: Floats) -> Floats:
         """Accelerometer reading (3,) at the window's end; of a body not accelerated where the window has no samples."""
@@ -236,59 +239,59 @@ class PositionBuilder:
         return np.asarray(nav_R_body.T @ np.array([0.0, 0.0, self.gravity]) + bias[:3])
 
     def _at_keyframe(
-        self, step: Step, window: Window, states: Mapping[str, SessionState]
-    ) -> tuple[int, Partial | None]:
+        self, update: GraphUpdate, window: Window, states: Mapping[str, SessionState]
+    ) -> tuple[int, PartialPreintegration | None]:
         if "T" not in states:
-            return step.index, None
-        rate = window.gyro[-1] if len(window.dt) else step.bias.gyroscope()
-        accel = self.force(window, step.predicted.attitude().matrix(), step.bias.vector())
-        return step.index, here(step.bias, accel, rate, self.gravity)
+            return update.index, None
+        rate = window.gyro[-1] if len(window.dt) else update.bias.gyroscope()
+        accel = self.force(window, update.predicted.attitude().matrix(), update.bias.vector())
+        return update.index, here(update.bias, accel, rate, self.gravity)
 
     def _add_row(
         self,
-        step: Step,
+        update: GraphUpdate,
         row: int,
-        memory: Memory,
+        pass_state: PassState,
         states: Mapping[str, SessionState],
-        at: tuple[int, Partial | None],
+        at: tuple[int, PartialPreintegration | None],
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
-        weight = memory.weight(self.name, row)
-        used = not memory.is_rejected(self.name, row) and weight > LEAST_WEIGHT
-        loss = self._loss_of(row, sigma, step, memory) if index == step.index else self._loss_late(memory)
-        if memory.narrowing and loss == "cauchy":
-            sigma = np.maximum(sigma, memory.control)
+        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else pass_state.scale(self.name))
+        weight = pass_state.weight(self.name, row)
+        used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
+        loss = self._loss_of(row, sigma, update, pass_state) if index == update.index else self._loss_late(pass_state)
+        if pass_state.narrowing and loss == "cauchy":
+            sigma = np.maximum(sigma, pass_state.control)
         sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
-        chain = self.name in memory.correlated
+        chain = self.name in pass_state.correlated
         if partial is None and not (states or chain):
             if used:
-                self._add_native(step, row, noise_model(sigma, loss))
+                self._add_native(update, row, noise_model(sigma, loss))
             return
         extra = ("C",) * chain + ("L",) * ("L" in states)
-        where = "keyframe" if index == step.index else "instant"
+        where = "keyframe" if index == update.index else "instant"
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         model = model_of(extra, "T" in states, where)
-        keys = step.keys(model.letters, index, states)
-        step.blocks.append(Block(self.name, model, [keys], data[None], step.t_ns, (row,), (used,), loss))
+        keys = update.keys(model.letters, index, states)
+        update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 
     def _softened(self, sigma: Floats, loss: str) -> tuple[Floats, str]:
         """Sigma (3,) and loss of a row as they are used."""
         return sigma, loss
 
-    def _loss_late(self, memory: Memory) -> str:
+    def _loss_late(self, pass_state: PassState) -> str:
         """Loss of a late fix in replay: no prediction of its own time is at hand to gate it with."""
         return "none" if self.config.loss == "none" else "huber"
 
-    def _add_native(self, step: Step, row: int, model: gtsam.noiseModel.Base) -> None:
-        pose, tag = key("X", step.index), Tag(self.name, step.t_ns, row)
+    def _add_native(self, update: GraphUpdate, row: int, model: gtsam.noiseModel.Base) -> None:
+        pose, tag = key("X", update.index), FactorId(self.name, update.t_ns, row)
         if self.lever[row].any():
-            step.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever[row], model))
+            update.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever[row], model))
         else:
-            step.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
+            update.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
 
 
 def build(context: FactorContext) -> PositionBuilder | None:

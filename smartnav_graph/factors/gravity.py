@@ -23,15 +23,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import rotate, skew
+from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.magnetometer import turned_mean
-from smartnav_graph.factors.observation import AtKeyframe, skew, turned
-from smartnav_graph.graph import Block, Memory, State, Step, Tag, Window, key
-from smartnav_graph.streams import ABSOLUTE
-from smartnav_graph.timebase import NS, ns_from_seconds
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.streams import ABSOLUTE
 
 # What holds tilt in the end: everything that knows position or velocity.
 HOLDS_TILT = (*ABSOLUTE, "velocity", "wheel")
@@ -74,7 +77,7 @@ class Upright:
         by_state, by_bias = np.zeros((len(R), 2, 9)), np.zeros((len(R), 2, 6))
         by_state[:, :, :3] = -level @ skew(force)
         by_bias[:, :, :3] = -level
-        return turned(R, force)[:, :2] * weight, by_state, [by_bias]
+        return rotate(R, force)[:, :2] * weight, by_state, [by_bias]
 
 
 MODEL = AtKeyframe(Upright())
@@ -121,7 +124,7 @@ class GravityBuilder:
     _stretch: Stretch = field(default_factory=Stretch)
     _begin_ns: int = 0
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Take the window into the stretch; a row where the stretch is long enough."""
         if window.kind == "first":
             self._begin_ns = window.t1_ns
@@ -129,18 +132,18 @@ class GravityBuilder:
         if window.kind in ("first", "gap") or window.t0_ns != self._stretch.end_ns or not self._alone(soon):
             self._stretch = Stretch(end_ns=window.t1_ns)
             return
-        self._stretch.add(window, step.bias.gyroscope())
+        self._stretch.add(window, update.bias.gyroscope())
         if self._stretch.length_s < self.config.stretch_s - 1e-6:
             return
         done, self._stretch = self._stretch, Stretch(end_ns=window.t1_ns)
         if not self._alone(window.t1_ns):
             return
         mean = done.force / done.length_s
-        data = np.append(mean, self.sigma(mean - step.bias.accelerometer(), done.scatter, done.length_s))[None]
-        keys = [(key("X", step.index), key("V", step.index), key("B", step.index))]
-        step.blocks.append(Block(self.name, MODEL, keys, data, step.t_ns, loss="huber"))
+        data = np.append(mean, self.sigma(mean - update.bias.accelerometer(), done.scatter, done.length_s))[None]
+        keys = [(key("X", update.index), key("V", update.index), key("B", update.index))]
+        update.blocks.append(FactorBatch(self.name, MODEL, keys, data, update.t_ns, loss="huber"))
         pace = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.config.speed, self.config.speed, self.config.climb]))
-        step.add(Tag("pace", step.t_ns), gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), pace))
+        update.add(FactorId("pace", update.t_ns), gtsam.PriorFactorVector(key("V", update.index), np.zeros(3), pace))
 
     def _alone(self, t_ns: int) -> bool:
         if self.config.enabled == "on" or not len(self.held_ns):

@@ -16,18 +16,18 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import scale, straying
-from smartnav_graph.factors.bridging import Bridge
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import Gap
+from smartnav_graph.factors import gap_error, imu_intrinsics
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.graph import LAST_STAGE, Memory, State, Step, Tag, Window, key
-from smartnav_graph.timebase import Gap
-
-Floats = NDArray[np.float64]
-
+from smartnav_graph.factors.gap_model import Bridge
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
 
 # Bias steps, m/s^2 and rad/s, over which preintegration is repeated.
 STALE_BIAS = np.array([0.1] * 3 + [1e-3] * 3)
@@ -52,13 +52,13 @@ class ImuConfig:
     gap_factor: float = 1.0
     estimate_noise: bool = True
     scale_sigma: float = 0.0
-    turn_share: float = 0.005
+    scale_error_share: float = 0.005
 
     def __post_init__(self) -> None:
         if not (self.integration_sigma > 0 and self.gap_factor > 0):
             raise ConfigError("config [imu]", "integration_sigma or gap_factor <= 0", "> 0")
-        if self.turn_share < 0:
-            raise ConfigError("config [imu]", f"turn_share = {self.turn_share}", ">= 0")
+        if self.scale_error_share < 0:
+            raise ConfigError("config [imu]", f"turn_share = {self.scale_error_share}", ">= 0")
         if not 0 <= self.scale_sigma < 0.2:
             raise ConfigError("config [imu]", f"scale_sigma = {self.scale_sigma}", "between 0 and 0.2")
 
@@ -116,15 +116,15 @@ class ImuBuilder:
     weight: float = CLASS_WEIGHT
     _spent_s: float = 0.0
     _kept: dict[int, Kept] = field(default_factory=dict)
-    _straying: straying.Straying = field(default_factory=straying.Straying)
+    _straying: gap_error.Straying = field(default_factory=gap_error.Straying)
 
-    def grows(self, memory: Memory) -> bool:
+    def grows(self, pass_state: PassState) -> bool:
         """Whether there is more to learn once the trajectory is found: the noise, scale factors."""
         return self.config.estimate_noise or self.config.scale_sigma > 0
 
-    def params(self, memory: Memory, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
+    def params(self, pass_state: PassState, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
-        scale_a, scale_g = memory.scale("accel"), memory.scale("gyro")
+        scale_a, scale_g = pass_state.scale("accel"), pass_state.scale("gyro")
         accel = np.full(3, self.noise.accel_noise_density * scale_a)
         gyro = np.full(3, self.noise.gyro_noise_density * scale_g)
         if bridge is not None:
@@ -143,39 +143,39 @@ class ImuBuilder:
         middle = (window.t0_ns + window.t1_ns) // 2
         return next(gap for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
 
-    def turning(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Memory:
+    def turning(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> PassState:
         """The memory with the gyro's noise of this window raised by what its turn may be off by.
 
         sigma^2 T = (density^2 T) + (share |turn|)^2, for a device of which no more than its class is known, in replay.
         """
         known = self.weight != CLASS_WEIGHT or self.config.scale_sigma > 0
-        if memory.phase != "causal" or known or window.kind == "gap" or not self.config.turn_share:
-            return memory
+        if pass_state.phase != "causal" or known or window.kind == "gap" or not self.config.scale_error_share:
+            return pass_state
         turn = float(np.linalg.norm(window.dt @ (window.gyro - bias.gyroscope())))
         own = self.noise.gyro_noise_density * np.sqrt(window.length_s)
-        scale = float(np.hypot(memory.scale("gyro"), self.config.turn_share * turn / own))
-        return replace(memory, noise_scales={**memory.noise_scales, "gyro": scale})
+        scale = float(np.hypot(pass_state.scale("gyro"), self.config.scale_error_share * turn / own))
+        return replace(pass_state, noise_scales={**pass_state.noise_scales, "gyro": scale})
 
-    def walk_sigma(self, memory: Memory) -> Floats:
+    def walk_sigma(self, pass_state: PassState) -> Floats:
         """Random walk (6,) of the biases over one second, accelerometer then gyroscope."""
-        accel = self.noise.accel_bias_walk * memory.scale("accel_walk")
-        return np.array([accel] * 3 + [self.noise.gyro_bias_walk * memory.scale("gyro_walk")] * 3)
+        accel = self.noise.accel_bias_walk * pass_state.scale("accel_walk")
+        return np.array([accel] * 3 + [self.noise.gyro_bias_walk * pass_state.scale("gyro_walk")] * 3)
 
-    def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
+    def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> Any:
         """GTSAM preintegrated measurements of one window, linearised at `bias` or, where that is good enough, as an
         earlier pass left them."""
-        scales, vector = (memory.scale("accel"), memory.scale("gyro")), bias.vector()
+        scales, vector = (pass_state.scale("accel"), pass_state.scale("gyro")), bias.vector()
         kept = self._kept.get(window.index)
         fresh = kept is not None and kept.window is window and (np.abs(vector - kept.bias) < KEPT_BIAS).all()
         if kept is not None and fresh and (kept.scales == scales or window.kind != "gap"):
             return kept.pim
-        pim = self._integrated(window, bias, memory)
+        pim = self._integrated(window, bias, pass_state)
         self._kept[window.index] = Kept(window, vector, scales, pim)
         return pim
 
-    def _integrated(self, window: Window, bias: gtsam.imuBias.ConstantBias, memory: Memory) -> Any:
+    def _integrated(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> Any:
         begin = time.perf_counter()
-        pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, memory), bias)
+        pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, pass_state), bias)
         integrate = pim.integrateMeasurement
         for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
             integrate(accel, gyro, dt)
@@ -187,9 +187,9 @@ class ImuBuilder:
         seconds, self._spent_s = self._spent_s, 0.0
         return seconds
 
-    def _covariance(self, window: Window, pim: Any, memory: Memory) -> Floats:
-        """Covariance (9, 9) of a window with the noise of `memory`, whatever noise it was preintegrated with."""
-        scales, old = (memory.scale("accel"), memory.scale("gyro")), self._kept[window.index].scales
+    def _covariance(self, window: Window, pim: Any, pass_state: PassState) -> Floats:
+        """Covariance (9, 9) of a window with the noise of `pass_state`, whatever noise it was preintegrated with."""
+        scales, old = (pass_state.scale("accel"), pass_state.scale("gyro")), self._kept[window.index].scales
         covariance: Floats = pim.preintMeasCov()
         if scales == old:
             return covariance
@@ -198,74 +198,76 @@ class ImuBuilder:
         gyro = (covariance - old[0] ** 2 * accel - integration) / old[1] ** 2
         return np.asarray(scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration)
 
-    def _factor(self, window: Window, pim: Any, memory: Memory) -> gtsam.NoiseModelFactor:
-        """Factor of a window with the noise of `memory`."""
+    def _factor(self, window: Window, pim: Any, pass_state: PassState) -> gtsam.NoiseModelFactor:
+        """Factor of a window with the noise of `pass_state`."""
         i, j = window.index - 1, window.index
         factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
-        if (memory.scale("accel"), memory.scale("gyro")) == self._kept[j].scales:
+        if (pass_state.scale("accel"), pass_state.scale("gyro")) == self._kept[j].scales:
             return factor
-        model = gtsam.noiseModel.Gaussian.Covariance(self._covariance(window, pim, memory))
+        model = gtsam.noiseModel.Gaussian.Covariance(self._covariance(window, pim, pass_state))
         return factor.cloneWithNewNoiseModel(model)
 
-    def _params_of(self, window: Window, memory: Memory) -> gtsam.PreintegrationParams:
+    def _params_of(self, window: Window, pass_state: PassState) -> gtsam.PreintegrationParams:
         gap = self._gap(window)
         if gap is not None:
-            return self.params(memory, self.bridges[gap.start_ns].over(window.length_s))
-        cached: tuple[Memory, gtsam.PreintegrationParams] | None = getattr(self, "_cache", None)
-        if cached is None or cached[0] is not memory:
-            cached = (memory, self.params(memory))
+            return self.params(pass_state, self.bridges[gap.start_ns].over(window.length_s))
+        cached: tuple[PassState, gtsam.PreintegrationParams] | None = getattr(self, "_cache", None)
+        if cached is None or cached[0] is not pass_state:
+            cached = (pass_state, self.params(pass_state))
             self._cache = cached
         return cached[1]
 
     def _variance(self, pim: Any, window: Window, previous: State, covariance: Floats) -> Floats:
         """Variance (3,) m^2 of the predicted position: the state's before, carried over, and the window's own."""
         gap, length_s = self._gap(window), window.length_s
-        strayed = 0.0 if gap is None else straying.largest(gap, self.bridges[gap.start_ns])
+        strayed = 0.0 if gap is None else gap_error.largest(gap, self.bridges[gap.start_ns])
         nav_R_body = previous.nav.attitude().matrix()
         own = np.diag(nav_R_body @ pim.preintMeasCov()[3:6, 3:6] @ nav_R_body.T)
         before = np.diag(covariance)
         lean = self.gravity**2 * before[:3].max() + strayed**2
         return np.asarray(before[3:6] + length_s**2 * before[6:9] + (0.5 * length_s**2) ** 2 * lean + own)
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
             self._straying.known.clear()
             return
-        memory = self.turning(window, previous.bias, memory)
-        pim = self.preintegrate(window, previous.bias, memory)
-        step.predicted = pim.predict(previous.nav, previous.bias)
-        step.bias = previous.bias
-        step.foretell = pim.predict
+        pass_state = self.turning(window, previous.bias, pass_state)
+        pim = self.preintegrate(window, previous.bias, pass_state)
+        update.predicted = pim.predict(previous.nav, previous.bias)
+        update.bias = previous.bias
+        update.predict = pim.predict
         if previous.covariance is not None:
-            step.variance = self._variance(pim, window, previous, previous.covariance)
-        self._add_inertial(step, window, previous, pim, memory)
+            update.variance = self._variance(pim, window, previous, previous.covariance)
+        self._add_inertial(update, window, previous, pim, pass_state)
         i, j = window.index - 1, window.index
-        walk = gtsam.noiseModel.Diagonal.Sigmas(self.walk_sigma(memory) * np.sqrt(window.length_s))
+        walk = gtsam.noiseModel.Diagonal.Sigmas(self.walk_sigma(pass_state) * np.sqrt(window.length_s))
         same = gtsam.BetweenFactorConstantBias(key("B", i), key("B", j), gtsam.imuBias.ConstantBias(), walk)
-        step.add(Tag("imu_bias", window.t1_ns), same)
+        update.add(FactorId("imu_bias", window.t1_ns), same)
 
-    def _add_inertial(self, step: Step, window: Window, previous: State, pim: Any, memory: Memory) -> None:
+    def _add_inertial(
+        self, update: GraphUpdate, window: Window, previous: State, pim: Any, pass_state: PassState
+    ) -> None:
         """The window as GTSAM's factor, or as a row where further states change what was read."""
         gap = self._gap(window)
         if gap is not None:
-            ends = self._straying.add(step, window, gap, self.bridges[gap.start_ns])
+            ends = self._straying.add(update, window, gap, self.bridges[gap.start_ns])
             if any(ends):
-                step.blocks.append(straying.row(window, ends, previous.bias, pim.preintMeasCov(), self.gravity))
+                update.blocks.append(gap_error.row(window, ends, previous.bias, pim.preintMeasCov(), self.gravity))
                 return
-        elif self.config.scale_sigma > 0 and memory.stage == LAST_STAGE:
-            covariance = self._covariance(window, pim, memory)
-            scale.add(step, window, previous.bias, covariance, self.gravity, self.config.scale_sigma)
+        elif self.config.scale_sigma > 0 and pass_state.stage == LAST_STAGE:
+            covariance = self._covariance(window, pim, pass_state)
+            imu_intrinsics.add(update, window, previous.bias, covariance, self.gravity, self.config.scale_sigma)
             return
         used = pim.biasHat().vector()
 
         def refresh(bias: Any) -> Any:
             if (np.abs(bias.vector() - used) < STALE_BIAS).all():
                 return None
-            return self._factor(window, self.preintegrate(window, bias, memory), memory)
+            return self._factor(window, self.preintegrate(window, bias, pass_state), pass_state)
 
-        step.refresh = refresh
-        step.add(Tag("imu", window.t1_ns), self._factor(window, pim, memory))
+        update.refresh = refresh
+        update.add(FactorId("imu", window.t1_ns), self._factor(window, pim, pass_state))
 
 
 def build(context: FactorContext) -> ImuBuilder:

@@ -23,16 +23,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.model import MagnetometerNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp, rotate, skew
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe, exp, skew, turned
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, SessionState, State, Step, Window, key
-from smartnav_graph.losses import check_loss
-from smartnav_graph.streams import Magnetometer
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.robust import check_loss
+from smartnav_graph.graph.states import SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import MagnetometerNoise
+from smartnav_graph.session.streams import Magnetometer
 
 # Streams whose positions tell the heading of whoever moves.
 # Names of the states.
@@ -84,11 +87,11 @@ class SeenField:
         unit = np.zeros((len(R), 3, 2))
         unit[:, :2, 0], unit[:, 2, 1] = north, 1.0
         by_strength = body_R_nav @ unit
-        seen = turned(by_strength, strength)
+        seen = rotate(by_strength, strength)
         by_state = np.zeros((len(R), 3, 9))
         by_state[:, :, :3] = skew(seen)
         w = weight[:, :, None]
-        return (seen + turned(A, iron) - y) * weight, by_state * w, [A * w, by_strength * w]
+        return (seen + rotate(A, iron) - y) * weight, by_state * w, [A * w, by_strength * w]
 
 
 MODEL = AtKeyframe(SeenField())
@@ -108,7 +111,7 @@ def turned_mean(window: Window, t_ns: NDArray[np.int64], field_ut: Floats, gyro_
     for k in range(len(t_ns) - 1, -1, -1):
         total = total @ steps[k].T
         turns[k] = total
-    return np.asarray(turned(turns, field_ut).mean(axis=0)), np.asarray(turns.mean(axis=0))
+    return np.asarray(rotate(turns, field_ut).mean(axis=0)), np.asarray(turns.mean(axis=0))
 
 
 @dataclass
@@ -143,7 +146,7 @@ class MagnetometerBuilder:
         the sigma of its prior: the same samples are used again."""
         self.iron, self.sure = replace(self.iron, initial=iron), min(sigma, self.iron_sigma)
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where it has samples and the gyro tells how they turned."""
         last = int(np.searchsorted(self.t_ns, window.t1_ns, side="right"))
         first = int(np.searchsorted(self.t_ns, window.t0_ns, side="right"))
@@ -154,11 +157,13 @@ class MagnetometerBuilder:
         y, turn = turned_mean(window, self.t_ns[rows], corrected, previous.bias.gyroscope())
         A = turn @ self.soft_iron
         sigma, shared = self.sigma(window.length_s, len(rows)), self.shared(window.length_s)
-        used = self._usable(memory) and not self.disturbed(step.predicted.attitude().matrix(), y, A, sigma)
+        used = self._usable(pass_state) and not self.disturbed(update.predicted.attitude().matrix(), y, A, sigma)
         data = np.concatenate([y, A.ravel(), [np.sin(self.declination), np.cos(self.declination), sigma]])
-        keys = (key("X", step.index), key("V", step.index), step.use(self.iron), step.use(self.field))
+        keys = (key("X", update.index), key("V", update.index), update.use(self.iron), update.use(self.field))
         loss, reach = self.config.loss, REACH / float(np.sqrt(shared))
-        step.blocks.append(Block(self.name, MODEL, [keys], data[None], step.t_ns, (last - 1,), (used,), loss, reach))
+        update.blocks.append(
+            FactorBatch(self.name, MODEL, [keys], data[None], update.t_ns, (last - 1,), (used,), loss, reach)
+        )
 
     def sigma(self, length_s: float, count: int) -> float:
         """Sigma (uT) of a row of `count` samples over `length_s` s.
@@ -173,9 +178,9 @@ class MagnetometerBuilder:
         on what one row is off by itself."""
         return max(1.0, 2.0 * self.noise.disturbance_s / length_s) if self.noise.disturbance_ut > 0 else 1.0
 
-    def _usable(self, memory: Memory) -> bool:
+    def _usable(self, pass_state: PassState) -> bool:
         """A hard iron that is held although nobody knows it would pass for north."""
-        return self.speaks(memory.phase == "causal", IRON in memory.held)
+        return self.speaks(pass_state.phase == "causal", IRON in pass_state.held)
 
     def speaks(self, causal: bool, held: bool = False) -> bool:
         """Whether rows are used in a replay (`causal`) or a batch run, the hard iron being held or not."""

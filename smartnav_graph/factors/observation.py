@@ -22,13 +22,12 @@ from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from smartnav_graph.graph import RowModel, Window
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp, rotate, skew
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.graph.update import RowModel
+from smartnav_graph.graph.windows import Window
 
 
 class Observation(Protocol):
@@ -58,43 +57,6 @@ class Observation(Protocol):
         ...
 
 
-def skew(v: Floats) -> Floats:
-    """Cross-product matrices (m, 3, 3) of vectors (m, 3)."""
-    zero = np.zeros(len(v))
-    rows = [zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
-
-
-def exp(w: Floats) -> Floats:
-    """Rotation matrices (m, 3, 3) of rotation vectors (m, 3)."""
-    return np.asarray(Rotation.from_rotvec(w).as_matrix())
-
-
-def turned(R: Floats, v: Floats) -> Floats:
-    """R v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
-    return np.asarray(np.einsum("nij,nj->ni", R, v))
-
-
-def left_jacobian_inverse(theta: Floats) -> Floats:
-    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
-    square = (theta**2).sum(axis=1)
-    angle = np.sqrt(np.maximum(square, 1e-16))
-    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
-    factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
-    cross = skew(theta)
-    return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
-
-
-def right_jacobian(theta: Floats) -> Floats:
-    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
-    square = (theta**2).sum(axis=1)
-    angle = np.sqrt(np.maximum(square, 1e-16))
-    one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
-    two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
-    cross = skew(theta)
-    return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
-
-
 class AtKeyframe:
     """Row model of an observation whose rows stand at keyframes, by a clock that is right."""
 
@@ -111,7 +73,7 @@ class AtKeyframe:
         return residual, [by_pose, by[:, :, 6:9], *by_extra]
 
 
-class Partial(NamedTuple):
+class PartialPreintegration(NamedTuple):
     """Preintegrated from a keyframe to an instant; see `preintegrated`.
 
     dt s; dR (3, 3), dp (3,), dv (3,) at `bias` (6,); by_bias (9, 6) of [rotation, dp, dv]; accel, gyro (3,) measured
@@ -154,13 +116,13 @@ SHORTEST_S = 1e-9
 _BIAS_STEP = np.array([1e-3] * 3 + [1e-5] * 3)
 
 
-def here(bias: Any, accel: Floats, gyro: Floats, gravity: float) -> Partial:
+def here(bias: Any, accel: Floats, gyro: Floats, gravity: float) -> PartialPreintegration:
     """The partial preintegration of no length: the instant is the keyframe itself."""
     zero = np.zeros(3)
-    return Partial(0.0, np.eye(3), zero, zero, np.zeros((9, 6)), bias.vector(), accel, gyro, gravity)
+    return PartialPreintegration(0.0, np.eye(3), zero, zero, np.zeros((9, 6)), bias.vector(), accel, gyro, gravity)
 
 
-def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Partial:
+def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> PartialPreintegration:
     """From the keyframe before `window` to the instant `t_ns` inside it, at `bias` (gtsam ConstantBias).
 
     Raises
@@ -180,7 +142,9 @@ def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Parti
     dR, dp, dv = pim.deltaRij().matrix(), pim.deltaPij(), pim.deltaVij()
     by_bias = _by_bias(pim, bias.vector())
     length = float(dt.sum())
-    return Partial(length, dR, dp, dv, by_bias, bias.vector(), window.accel[last], window.gyro[last], gravity)
+    return PartialPreintegration(
+        length, dR, dp, dv, by_bias, bias.vector(), window.accel[last], window.gyro[last], gravity
+    )
 
 
 def _by_bias(pim: Any, base: Floats) -> Floats:
@@ -211,9 +175,10 @@ def _until(dt: Floats, length: float) -> Floats:
 class AtInstant:
     """Row model of an observation at any time after a keyframe.
 
-    Data: the observation's columns, then those of `Partial.columns`. `timed` adds the time offset T of its sensor (s):
-    the row speaks of IMU time t + T. `short` is for rows at their keyframe (`here`), where the bias matters only
-    through the offset: it is taken as it was when the row was made, and is no state of the row.
+    Data: the observation's columns, then those of `PartialPreintegration.columns`. `timed` adds the time
+    offset T of its sensor (s): the row speaks of IMU time t + T. `short` is for rows at
+    their keyframe (`here`), where the bias matters only through the offset: it is taken as it was when the row was
+    made, and is no state of the row.
     """
 
     def __init__(self, observation: Observation, *, timed: bool = False, short: bool = False) -> None:
@@ -227,7 +192,7 @@ class AtInstant:
         pose, velocity, *rest = states
         at = _unpack(data[:, self.observation.width :])
         bias = at["bias"] if self.short else rest.pop(0)
-        there = _present(pose, velocity) if self.short else foretold(pose, velocity, bias, at)
+        there = _present(pose, velocity) if self.short else propagate(pose, velocity, bias, at)
         clock: list[Floats] = []
         if self.timed:
             offset = rest.pop(0)
@@ -247,7 +212,7 @@ def row_model(observation: Observation, *, timed: bool = False, where: str = "ke
 
 
 @dataclass(frozen=True)
-class There:
+class StateAt:
     """State at the instant; by : derivatives (m, 9, n) by pose, velocity and bias."""
 
     R: Floats
@@ -264,27 +229,27 @@ def _unpack(columns: Floats) -> dict[str, Floats]:
     return out
 
 
-def _present(pose: Floats, velocity: Floats) -> There:
+def _present(pose: Floats, velocity: Floats) -> StateAt:
     """At the keyframe itself."""
     R, eye = pose[:, :3, :3], np.eye(3)
     by_pose, by_velocity, by_bias = (np.zeros((len(pose), 9, n)) for n in (6, 3, 6))
     by_pose[:, :3, :3], by_pose[:, 3:6, 3:], by_velocity[:, 6:9] = eye, R, eye
-    return There(R, pose[:, :3, 3], velocity, (by_pose, by_velocity, by_bias))
+    return StateAt(R, pose[:, :3, 3], velocity, (by_pose, by_velocity, by_bias))
 
 
-def foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> There:
+def propagate(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]) -> StateAt:
     """By the partial preintegration, corrected to first order for the bias (m, 6), or for whatever its derivatives
     `by_bias` go by."""
     m, size = bias.shape
     by_bias = at["by_bias"].reshape(m, 9, size)
-    change = turned(by_bias, bias - at["bias"])
+    change = rotate(by_bias, bias - at["bias"])
     turn = exp(change[:, :3])
     dR = at["dR"].reshape(m, 3, 3) @ turn
     dp, dv = at["dp"] + change[:, 3:6], at["dv"] + change[:, 6:9]
     Ri, dt = pose[:, :3, :3], at["dt"]
     fall = np.array([0.0, 0.0, -1.0]) * at["gravity"]
-    p = pose[:, :3, 3] + velocity * dt + 0.5 * fall * dt**2 + turned(Ri, dp)
-    v = velocity + fall * dt + turned(Ri, dv)
+    p = pose[:, :3, 3] + velocity * dt + 0.5 * fall * dt**2 + rotate(Ri, dp)
+    v = velocity + fall * dt + rotate(Ri, dv)
     by_pose, by_velocity, by_b = np.zeros((m, 9, 6)), np.zeros((m, 9, 3)), np.zeros((m, 9, size))
     by_pose[:, :3, :3] = dR.transpose(0, 2, 1)
     by_pose[:, 3:6, :3] = -Ri @ skew(dp)
@@ -294,14 +259,14 @@ def foretold(pose: Floats, velocity: Floats, bias: Floats, at: dict[str, Floats]
     by_velocity[:, 6:9] = np.eye(3)
     by_b[:, :3] = (np.eye(3) - 0.5 * skew(change[:, :3])) @ by_bias[:, :3]
     by_b[:, 3:6], by_b[:, 6:9] = Ri @ by_bias[:, 3:6], Ri @ by_bias[:, 6:9]
-    return There(Ri @ dR, p, v, (by_pose, by_velocity, by_b))
+    return StateAt(Ri @ dR, p, v, (by_pose, by_velocity, by_b))
 
 
-def _delayed(there: There, bias: Floats, delta: Floats, at: dict[str, Floats]) -> tuple[There, Floats]:
+def _delayed(there: StateAt, bias: Floats, delta: Floats, at: dict[str, Floats]) -> tuple[StateAt, Floats]:
     """The state `delta` (m,) s later, and its derivative (m, 9, 1) by it."""
     m, d = len(delta), delta[:, None]
     rate, force = at["gyro"] - bias[:, 3:], at["accel"] - bias[:, :3]
-    a = turned(there.R, force) + np.array([0.0, 0.0, -1.0]) * at["gravity"]
+    a = rotate(there.R, force) + np.array([0.0, 0.0, -1.0]) * at["gravity"]
     turn = exp(rate * d)
     onward = np.zeros((m, 9, 9))
     onward[:, :3, :3] = turn.transpose(0, 2, 1)
@@ -316,4 +281,4 @@ def _delayed(there: There, bias: Floats, delta: Floats, at: dict[str, Floats]) -
     by_bias[:, 6:9, :3] -= d[:, :, None] * there.R
     p, v = there.p + there.v * d + 0.5 * a * d**2, there.v + a * d
     by_clock = np.concatenate([rate, v, a], axis=1)[:, :, None]
-    return There(there.R @ turn, p, v, (by_pose, by_velocity, by_bias)), by_clock
+    return StateAt(there.R @ turn, p, v, (by_pose, by_velocity, by_bias)), by_clock

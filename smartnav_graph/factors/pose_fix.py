@@ -19,25 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.model import GnssNoise
-from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
-from smartnav_graph.factors.observation import (
-    Partial,
-    exp,
-    here,
-    left_jacobian_inverse,
-    preintegrated,
-    right_jacobian,
-    row_model,
-)
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, RowModel, SessionState, State, Step, Window
-from smartnav_graph.session import Session
-from smartnav_graph.streams import PoseFix
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.states import SessionState, State
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import PoseFix
 
 NAME = "pose_fixes"
 ATTITUDE = "pose_attitude"
@@ -67,13 +62,13 @@ class PoseFixConfig:
             raise ConfigError("config [pose_fixes]", "latency_s or a sigma < 0", ">= 0")
 
 
-def at_their_time(session: Session, config: PoseFixConfig) -> Session:
+def undo_latency(session: Session, config: PoseFixConfig) -> Session:
     """The session with its pose fixes stamped with the time they speak of, where their latency is known."""
     fixes = session.pose_fixes
     if fixes is None or config.latency_s == 0:
         return session
     stamps = fixes.t_ns - round(config.latency_s * NS)
-    return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=fixes.known_ns))
+    return session.replace(pose_fixes=replace(fixes, t_ns=stamps, arrival_ns=fixes.available_ns))
 
 
 class AttitudeFix:
@@ -140,9 +135,9 @@ class AttitudeBuilder:
         """Share of good rows inside the gate that outliers fail; None where none are looked for."""
         return self.config.gate_probability if self.config.loss == "gate" else None
 
-    def _states(self, memory: Memory) -> dict[str, SessionState]:
+    def _states(self, pass_state: PassState) -> dict[str, SessionState]:
         """Session states in use, by letter."""
-        if memory.stage < LAST_STAGE:
+        if pass_state.stage < LAST_STAGE:
             return {}
         found = {}
         if self.config.time_offset_sigma > 0:
@@ -152,48 +147,48 @@ class AttitudeBuilder:
             found["A"] = SessionState("A", NAME, f"{NAME}_mount_correction_rad", np.zeros(3), turn)
         return found
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A row for every attitude that became known in the window."""
-        states = self._states(memory)
+        states = self._states(pass_state)
         for row in window.rows.get(NAME, ()):
             if self.known[row]:
-                partial = self._here(step, window) if "T" in states else None
-                self._add_row(step, int(row), memory, states, step.index, partial)
+                partial = self._here(update, window) if "T" in states else None
+                self._add_row(update, int(row), pass_state, states, update.index, partial)
         for late in window.late.get(NAME, ()):
             if self.known[late.row]:
                 assert previous is not None
                 partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
-                self._add_row(step, late.row, memory, states, late.window.index - 1, partial)
+                self._add_row(update, late.row, pass_state, states, late.window.index - 1, partial)
 
-    def _here(self, step: Step, window: Window) -> Partial:
+    def _here(self, update: GraphUpdate, window: Window) -> PartialPreintegration:
         """The instant of the keyframe itself; only its rate matters to an attitude."""
-        rate = window.gyro[-1] if len(window.dt) else step.bias.gyroscope()
-        return here(step.bias, np.zeros(3), rate, self.gravity)
+        rate = window.gyro[-1] if len(window.dt) else update.bias.gyroscope()
+        return here(update.bias, np.zeros(3), rate, self.gravity)
 
     def _add_row(
         self,
-        step: Step,
+        update: GraphUpdate,
         row: int,
-        memory: Memory,
+        pass_state: PassState,
         states: Mapping[str, SessionState],
         index: int,
-        partial: Partial | None,
+        partial: PartialPreintegration | None,
     ) -> None:
-        where = "keyframe" if index == step.index else "instant"
-        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else memory.scale(self.name))
+        where = "keyframe" if index == update.index else "instant"
+        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else pass_state.scale(self.name))
         data = np.concatenate([self.attitude[row].ravel(), self.mount.ravel(), sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        used = not (memory.is_rejected(self.name, row) or memory.is_rejected(NAME, row))
+        used = not (pass_state.is_rejected(self.name, row) or pass_state.is_rejected(NAME, row))
         model = model_of(("A",) * ("A" in states), "T" in states, where)
-        keys, loss = step.keys(model.letters, index, states), self._loss(memory)
-        step.blocks.append(Block(self.name, model, [keys], data[None], step.t_ns, (row,), (used,), loss))
+        keys, loss = update.keys(model.letters, index, states), self._loss(pass_state)
+        update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 
-    def _loss(self, memory: Memory) -> str:
-        """Loss in the phase at hand; see `Memory`."""
+    def _loss(self, pass_state: PassState) -> str:
+        """Loss in the phase at hand; see `PassState`."""
         if self.config.loss != "gate":
             return self.config.loss
-        return "huber" if memory.phase in ("robust", "causal") else "none"
+        return "huber" if pass_state.phase in ("robust", "causal") else "none"
 
 
 def build(context: FactorContext) -> PoseFixBuilder | None:

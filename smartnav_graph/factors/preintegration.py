@@ -18,13 +18,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.factors.observation import exp, foretold, left_jacobian_inverse, right_jacobian, skew, turned
-from smartnav_graph.graph import STATES, Window
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian, rotate, skew
+from smartnav_graph.factors.observation import propagate
+from smartnav_graph.graph.states import STATES
+from smartnav_graph.graph.windows import Window
 
 
 class Integrated(NamedTuple):
@@ -47,7 +47,7 @@ def integrated(dt: Floats, force: Floats, rate: Floats, force_by: Floats, rate_b
     R[0] = np.eye(3)
     for k, turn in enumerate(exp(rate * dt[:, None])):
         R[k + 1] = R[k] @ turn
-    led = turned(R[:-1], force)
+    led = rotate(R[:-1], force)
     change = R[1:] @ right_jacobian(rate * dt[:, None]) * dt[:, None, None] @ rate_by
     psi = np.zeros_like(change)
     psi[1:] = np.cumsum(change, axis=0)[:-1]
@@ -97,11 +97,11 @@ class InertialRow:
         """See `graph.RowModel`."""
         pose, velocity, pose_j, velocity_j, *rest = states
         at = self.unpacked(data)
-        there = foretold(pose, velocity, np.concatenate(rest, axis=1), at)
+        there = propagate(pose, velocity, np.concatenate(rest, axis=1), at)
         Ri, Rj = pose[:, :3, :3], pose_j[:, :3, :3]
         back = Ri.transpose(0, 2, 1)
         turn = Rotation.from_matrix(there.R.transpose(0, 2, 1) @ Rj).as_rotvec()
-        dp, dv = turned(back, pose_j[:, :3, 3] - there.p), turned(back, velocity_j - there.v)
+        dp, dv = rotate(back, pose_j[:, :3, 3] - there.p), rotate(back, velocity_j - there.v)
         m = len(pose)
         by_there = np.zeros((m, 9, 9))
         by_there[:, :3, :3] = -left_jacobian_inverse(turn)
@@ -114,6 +114,6 @@ class InertialRow:
         after[:, 3:6, 3:] = back @ Rj
         speed[:, 6:] = back
         root = at["root"].reshape(m, 9, 9)
-        residual = turned(root, np.concatenate([turn, dp, dv], axis=1))
+        residual = rotate(root, np.concatenate([turn, dp, dv], axis=1))
         by_others = np.split(by_rest, np.cumsum(self.sizes)[:-1], axis=2)
         return residual, [root @ jacobian for jacobian in (by_pose, by_velocity, after, speed, *by_others)]

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.factors.magnetometer import IRON
-from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
-
-Floats = NDArray[np.float64]
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
 
 UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
 UNKNOWN_PLACE = 1e5  # m
@@ -67,40 +68,44 @@ class PriorBuilder:
         mean = self.start.bias if self.rest_end_ns is None else self.bias_mean
         return replace(self, sigma_pos=place, bias_mean=mean)
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Prior factors and initial values of the first keyframe; later only zero velocity while the rest lasts."""
         if window.kind != "first":
             if self.rest_end_ns is not None and window.t1_ns <= self.rest_end_ns:
                 still = gtsam.noiseModel.Isotropic.Sigma(3, REST_SPEED)
-                step.add(Tag("rest", window.t1_ns), gtsam.PriorFactorVector(key("V", window.index), np.zeros(3), still))
+                update.add(
+                    FactorId("rest", window.t1_ns), gtsam.PriorFactorVector(key("V", window.index), np.zeros(3), still)
+                )
             return
-        step.predicted, step.bias = self.start.nav, self.start.bias
-        tag = Tag("prior", window.t1_ns)
+        update.predicted, update.bias = self.start.nav, self.start.bias
+        tag = FactorId("prior", window.t1_ns)
         x, v, b = (key(letter, window.index) for letter in "XVB")
         pose = self.start.nav.pose()
         attitude = pose.rotation() if self.attitude is None else self.attitude
         nav_R_body = attitude.matrix()
-        rot = nav_R_body.T @ np.diag(self._sigma_rot(memory) ** 2) @ nav_R_body
+        rot = nav_R_body.T @ np.diag(self._sigma_rot(pass_state) ** 2) @ nav_R_body
         if self.sigma_pos is None:
             model = gtsam.noiseModel.Gaussian.Covariance(rot)
-            step.add(tag, gtsam.PoseRotationPrior3D(x, attitude, model))
+            update.add(tag, gtsam.PoseRotationPrior3D(x, attitude, model))
         else:
             cov = np.zeros((6, 6))
             cov[:3, :3] = rot
             cov[3:, 3:] = nav_R_body.T @ np.diag(self.sigma_pos**2) @ nav_R_body
-            step.add(
+            update.add(
                 tag,
                 gtsam.PriorFactorPose3(
                     x, gtsam.Pose3(attitude, pose.translation()), gtsam.noiseModel.Gaussian.Covariance(cov)
                 ),
             )
-        step.add(tag, gtsam.PriorFactorVector(v, self.velocity_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_vel)))
-        step.add(
+        update.add(
+            tag, gtsam.PriorFactorVector(v, self.velocity_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_vel))
+        )
+        update.add(
             tag,
             gtsam.PriorFactorConstantBias(b, self.bias_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_bias)),
         )
 
-    def _sigma_rot(self, memory: Memory) -> Floats:
-        if self.magnetic_stage is None or memory.stage < self.magnetic_stage or IRON in memory.held:
+    def _sigma_rot(self, pass_state: PassState) -> Floats:
+        if self.magnetic_stage is None or pass_state.stage < self.magnetic_stage or IRON in pass_state.held:
             return self.sigma_rot
         return np.array([*self.sigma_rot[:2], UNKNOWN_ANGLE])

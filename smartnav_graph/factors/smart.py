@@ -25,17 +25,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors.camera import BodyRates, Eye, eye_of
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.factors.camera import BodyRates, CameraModel, make_camera_model
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanarity import SMART
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.graph import Memory, State, Step, Tag, Window, key
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
 from smartnav_graph.vision.points import Sightings, of_tracks
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A track needs so many observations: with two, the point takes all but what a pair says.
 LEAST_SEEN = 3
@@ -86,7 +87,7 @@ class SmartBuilder:
     sightings: Sightings
     image_ns: NDArray[np.int64]
     rates: BodyRates
-    eye: Eye
+    camera_model: CameraModel
     sigma: float
     merge_ns: int
     config: SmartConfig = field(default_factory=SmartConfig)
@@ -103,7 +104,7 @@ class SmartBuilder:
         self.use, self.xy = self.sightings.there.copy(), self.sightings.xy.copy()
         self.verdict = np.full(len(self.sightings), OUTSIDE, dtype=np.intp)
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The tracks that end at the window's end."""
         if previous is None:
             self._keyframe = {}
@@ -111,21 +112,21 @@ class SmartBuilder:
         if near == len(self.image_ns) or self.image_ns[near] > window.t1_ns + self.merge_ns:
             return
         self._keyframe[near] = window.index
-        if not self.in_force(memory):
+        if not self.in_force(pass_state):
             return
-        for state in self.eye.states().values():
-            step.use(state)
+        for state in self.camera_model.states().values():
+            update.use(state)
         first, last = np.searchsorted(self.sightings.last, [near, near + 1])
         for row in range(first, last):
             if self.verdict[row] == IN_USE:
-                step.add(Tag(self.name, step.t_ns, row), self._factor(row, memory))
+                update.add(FactorId(self.name, update.t_ns, row), self._factor(row, pass_state))
 
-    def in_force(self, memory: Memory) -> bool:
+    def in_force(self, pass_state: PassState) -> bool:
         """Whether tracks stand in for image pairs in a pass with this memory."""
-        return memory.settled.get(self.name, 0) > 0 and memory.phase != "causal"
+        return pass_state.settled.get(self.name, 0) > 0 and pass_state.phase != "causal"
 
-    def _factor(self, row: int, memory: Memory) -> Any:
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, FOCAL * self.sigma * memory.scale(self.name))
+    def _factor(self, row: int, pass_state: PassState) -> Any:
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, FOCAL * self.sigma * pass_state.scale(self.name))
         factor = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _IDEAL, self._mount, _PARAMS)
         for place in np.flatnonzero(self.use[row]):
             factor.add(FOCAL * self.xy[row, place], key("X", self._keyframe[int(self.sightings.image[row, place])]))
@@ -134,11 +135,11 @@ class SmartBuilder:
     @property
     def body_R_cam(self) -> Floats:
         """With the boresight found."""
-        return np.asarray(self.eye.rig.body_R_cam @ exp(self.boresight[None])[0])
+        return np.asarray(self.camera_model.rig.body_R_cam @ exp(self.boresight[None])[0])
 
     @property
     def _mount(self) -> Any:
-        return gtsam.Pose3(gtsam.Rot3(self.body_R_cam), self.eye.rig.body_t_cam)
+        return gtsam.Pose3(gtsam.Rot3(self.body_R_cam), self.camera_model.rig.body_t_cam)
 
 
 def _params() -> Any:
@@ -172,13 +173,13 @@ def build(context: FactorContext) -> SmartBuilder | None:
         found = "enabled in a replay without its polish"
         expected = "a batch run or a polish: a track is settled once all of it was seen"
         raise ConfigError("config [smart]", found, expected, "leave replay.polish on, or smart off")
-    eye = eye_of(context, context.config.coplanarity)
+    camera_model = make_camera_model(context, context.config.coplanarity)
     return SmartBuilder(
         of_tracks(tracks, pairs.t_ns, config.most_seen),
         context.image_ns,
         BodyRates(context.session.require_imu()),
-        eye,
-        eye.camera.noise,
+        camera_model,
+        camera_model.camera.noise,
         round(context.config.keyframes.merge_s * NS),
         config,
     )

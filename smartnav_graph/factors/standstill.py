@@ -21,14 +21,15 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe
-from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Tag, Window, key
-from smartnav_graph.standstill import StandstillConfig, Standstills
-
-Floats = NDArray[np.float64]
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.detect.standstills import StandstillConfig, Standstills
 
 TAIL = 4.0
 # In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second; in metres a second.
@@ -74,28 +75,28 @@ class StandstillBuilder:
     stage: int = 0
     _floor: SessionState | None = None
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors at the keyframe that ends `window`."""
         speed = self.rests.speed_at(window.t1_ns)
         if np.isfinite(speed):
             if self.config.zupt:
-                self._add_speed(step, speed, _unknown(previous))
+                self._add_speed(update, speed, _unknown(previous))
             if self.config.flat_floor and self.rests.on_foot:
-                self._add_level(step)
+                self._add_level(update)
         if self.config.zaru and previous is not None and window.kind != "gap":
             turn = self.rests.over(self.rests.turn_sigma, window.t0_ns, window.t1_ns)
             if np.isfinite(turn):
-                self._add_turn(step, turn)
+                self._add_turn(update, turn)
 
-    def _add_speed(self, step: Step, sigma: float, unknown: float) -> None:
+    def _add_speed(self, update: GraphUpdate, sigma: float, unknown: float) -> None:
         lets_go = max(LETS_GO_SPEED / sigma, CONTRADICTS * unknown / sigma, TAIL)
-        zero = gtsam.PriorFactorVector(key("V", step.index), np.zeros(3), self._noise(np.full(3, sigma), lets_go))
-        step.add(Tag(self.name, step.t_ns), zero)
+        zero = gtsam.PriorFactorVector(key("V", update.index), np.zeros(3), self._noise(np.full(3, sigma), lets_go))
+        update.add(FactorId(self.name, update.t_ns), zero)
 
-    def _add_turn(self, step: Step, sigma: float) -> None:
-        before, here = key("X", step.index - 1), key("X", step.index)
+    def _add_turn(self, update: GraphUpdate, sigma: float) -> None:
+        before, here = key("X", update.index - 1), key("X", update.index)
         model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3), LETS_GO)
-        step.add(Tag("static_turn", step.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
+        update.add(FactorId("static_turn", update.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
 
     def _noise(self, sigmas: Floats, lets_go: float) -> gtsam.noiseModel.Base:
         """Diagonal noise under the loss of a rest or of a stance."""
@@ -103,13 +104,13 @@ class StandstillBuilder:
         loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(lets_go)
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
-    def _add_level(self, step: Step) -> None:
+    def _add_level(self, update: GraphUpdate) -> None:
         if self._floor is None:
-            height = np.array([step.predicted.position()[2]])
+            height = np.array([update.predicted.position()[2]])
             self._floor = SessionState("U", self.name, "floor_height_m", height, np.array([UNKNOWN_LEVEL]))
-        keys = (key("X", step.index), key("V", step.index), step.use(self._floor))
+        keys = (key("X", update.index), key("V", update.index), update.use(self._floor))
         data = np.array([[self.config.floor_sigma]])
-        step.blocks.append(Block("static_level", MODEL, [keys], data, step.t_ns, loss="huber"))
+        update.blocks.append(FactorBatch("static_level", MODEL, [keys], data, update.t_ns, loss="huber"))
 
 
 def _unknown(previous: State | None) -> float:

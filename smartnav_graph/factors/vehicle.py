@@ -20,19 +20,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import VEHICLE_CLASSES, VehicleNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import rotate, skew
+from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe, skew, turned
-from smartnav_graph.graph import STATES, Block, Memory, SessionState, State, Step, Window, key
-from smartnav_graph.losses import check_loss
-from smartnav_graph.standstill import Standstills
-from smartnav_graph.timebase import NS, Gap
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.robust import check_loss
+from smartnav_graph.graph.states import STATES, SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import VEHICLE_CLASSES, VehicleNoise
+from smartnav_graph.session.detect.standstills import Standstills
 
 MOUNT_SIZE = STATES["M"].dim
 # Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken: a mean,
@@ -100,7 +102,7 @@ class VehicleAxes:
 
     def turn(self, declared: Floats) -> Turned:
         """Vectors (m, 3) given in declared vehicle axes."""
-        return Turned(turned(self.rotation, declared), np.einsum("nkij,nj->nik", self.by, declared))
+        return Turned(rotate(self.rotation, declared), np.einsum("nkij,nj->nik", self.by, declared))
 
 
 @dataclass(frozen=True)
@@ -115,9 +117,9 @@ class DeclaredVelocity:
         nav_R_vehicle = R @ body_R_vehicle
         vehicle_R_nav = nav_R_vehicle.transpose(0, 2, 1)
         by_state = np.zeros((len(v), 3, 9))
-        by_state[:, :, :3] = body_R_vehicle.T @ skew(turned(R.transpose(0, 2, 1), v))
+        by_state[:, :, :3] = body_R_vehicle.T @ skew(rotate(R.transpose(0, 2, 1), v))
         by_state[:, :, 6:] = vehicle_R_nav
-        return cls(turned(vehicle_R_nav, v), by_state)
+        return cls(rotate(vehicle_R_nav, v), by_state)
 
 
 class NonHolonomic:
@@ -210,24 +212,26 @@ class VehicleBuilder:
         noise = self.noise
         self.noise_groups = {"vehicle_lateral": noise.lateral_sigma, "vehicle_vertical": noise.vertical_sigma}
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where one is due."""
-        if not len(window.dt) or not due(window, self.config.period_s) or self._silent(step):
+        if not len(window.dt) or not due(window, self.config.period_s) or self._silent(update):
             return
-        rate = recent(window, window.gyro, RATE_S) - step.bias.gyroscope()
-        force = latest(window, window.accel, FORCE_S) - step.bias.accelerometer()
-        sigma = [known * memory.scale(group) for group, known in self.noise_groups.items()]
+        rate = recent(window, window.gyro, RATE_S) - update.bias.gyroscope()
+        force = latest(window, window.accel, FORCE_S) - update.bias.accelerometer()
+        sigma = [known * pass_state.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
-        keys = [key("X", step.index), key("V", step.index), step.use(mount_state(self.config))]
-        strays = key("G", step.index) in step.chain
+        keys = [key("X", update.index), key("V", update.index), update.use(mount_state(self.config))]
+        strays = key("G", update.index) in update.chain
         model = self.strayed if strays else self.model
-        keys += [key("G", step.index)] * strays
-        step.blocks.append(Block(self.name, model, [tuple(keys)], data[None], step.t_ns, loss=self.config.loss))
+        keys += [key("G", update.index)] * strays
+        update.blocks.append(
+            FactorBatch(self.name, model, [tuple(keys)], data[None], update.t_ns, loss=self.config.loss)
+        )
 
-    def _silent(self, step: Step) -> bool:
-        still = self.rests is not None and np.isfinite(self.rests.speed_at(step.t_ns))
-        unknown = any(gap.start_ns < step.t_ns < gap.end_ns for gap in self.gaps)
-        return bool(still) or (unknown and key("G", step.index) not in step.chain)
+    def _silent(self, update: GraphUpdate) -> bool:
+        still = self.rests is not None and np.isfinite(self.rests.speed_at(update.t_ns))
+        unknown = any(gap.start_ns < update.t_ns < gap.end_ns for gap in self.gaps)
+        return bool(still) or (unknown and key("G", update.index) not in update.chain)
 
 
 def build(context: FactorContext) -> VehicleBuilder | None:

@@ -13,18 +13,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import rotate, skew
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, clock_state
-from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here, skew, turned
-from smartnav_graph.graph import LAST_STAGE, Block, Memory, State, Step, Window, key
-from smartnav_graph.losses import check_loss
-from smartnav_graph.streams import Velocity
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.robust import check_loss
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.streams import Velocity
 
 # A velocity at a keyframe is interpolated between readings no further apart than this, s.
 APART_S = 0.5
@@ -59,7 +61,7 @@ class NavVelocity:
         by_state = np.zeros((len(v), 3, 9))
         by_state[:, :, :3] = -R @ skew(arm)
         by_state[:, :, 6:] = np.eye(3)
-        return (v + turned(R, arm) - data[:, :3]) * weight, by_state * weight[:, :, None], []
+        return (v + rotate(R, arm) - data[:, :3]) * weight, by_state * weight[:, :, None], []
 
 
 class BodyVelocity:
@@ -74,7 +76,7 @@ class BodyVelocity:
         """See `observation.Observation`."""
         weight = 1.0 / data[:, 6:9]
         body_R_nav = R.transpose(0, 2, 1)
-        body = turned(body_R_nav, v)
+        body = rotate(body_R_nav, v)
         by_state = np.zeros((len(v), 3, 9))
         by_state[:, :, :3] = skew(body)
         by_state[:, :, 6:] = body_R_nav
@@ -107,23 +109,23 @@ class GnssVelocityBuilder:
     name: str = "gnss_velocity"
     stage: int = 0
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A row for every known velocity at the keyframe."""
         rows = [int(row) for row in window.rows.get("gnss", ()) if np.isfinite(self.velocity[row]).all()]
         if not rows:
             return
-        states: tuple[int, ...] = (key("X", step.index), key("V", step.index))
-        arm = np.cross(rate_at_end(window, step.bias), self.lever)
+        states: tuple[int, ...] = (key("X", update.index), key("V", update.index))
+        arm = np.cross(rate_at_end(window, update.bias), self.lever)
         tail = np.zeros(0)
-        timed = memory.stage >= LAST_STAGE and self.gnss.time_offset_sigma > 0 and len(window.dt) > 0
+        timed = pass_state.stage >= LAST_STAGE and self.gnss.time_offset_sigma > 0 and len(window.dt) > 0
         if timed:
-            states = (*states, key("B", step.index), step.use(clock_state("gnss", self.gnss.time_offset_sigma)))
-            tail = here(step.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
+            states = (*states, key("B", update.index), update.use(clock_state("gnss", self.gnss.time_offset_sigma)))
+            tail = here(update.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
         data = np.array([np.concatenate([self.velocity[row], arm, self.sigma[row], tail]) for row in rows])
-        used = tuple(bool(known) for known in memory.used("gnss", np.array(rows, dtype=np.intp)))
+        used = tuple(bool(known) for known in pass_state.used("gnss", np.array(rows, dtype=np.intp)))
         model = NAV_MODEL_TIMED if timed else NAV_MODEL
-        block = Block(self.name, model, [states] * len(rows), data, step.t_ns, rows, used, self.config.loss)
-        step.blocks.append(block)
+        block = FactorBatch(self.name, model, [states] * len(rows), data, update.t_ns, rows, used, self.config.loss)
+        update.blocks.append(block)
 
 
 @dataclass
@@ -137,16 +139,16 @@ class BodyVelocityBuilder:
     stage: int = 0
     lookahead_s: float = APART_S
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the window's end where readings surround it."""
         found = self._at(window.t1_ns)
         if found is None:
             return
         velocity, sigma = found
-        arm = np.cross(rate_at_end(window, step.bias), self.lever)
-        data = np.concatenate([velocity, arm, sigma * memory.scale(self.name)])[None]
-        keys = (key("X", step.index), key("V", step.index))
-        step.blocks.append(Block(self.name, BODY_MODEL, [keys], data, step.t_ns, loss=self.config.loss))
+        arm = np.cross(rate_at_end(window, update.bias), self.lever)
+        data = np.concatenate([velocity, arm, sigma * pass_state.scale(self.name)])[None]
+        keys = (key("X", update.index), key("V", update.index))
+        update.blocks.append(FactorBatch(self.name, BODY_MODEL, [keys], data, update.t_ns, loss=self.config.loss))
 
     def _at(self, t_ns: int) -> tuple[Floats, Floats] | None:
         """Velocity (3,) and its sigma (3,); neighbours with a share s and 1 - s in it have (s^2 + (1 - s)^2) of the

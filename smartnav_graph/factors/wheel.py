@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import VEHICLE_CLASSES
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.factors.vehicle import (
@@ -28,12 +28,13 @@ from smartnav_graph.factors.vehicle import (
     mount_state,
     recent,
 )
-from smartnav_graph.graph import Block, Memory, SessionState, State, Step, Window, key
-from smartnav_graph.losses import check_loss
-from smartnav_graph.streams import WheelSpeed
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.robust import check_loss
+from smartnav_graph.graph.states import SessionState, State, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import VEHICLE_CLASSES
+from smartnav_graph.session.streams import WheelSpeed
 
 # Readings this far (s) before and after a keyframe make its straight line: 1 cm/s of curvature when a car brakes hard.
 HALF_LINE_S = 0.2
@@ -115,7 +116,7 @@ class WheelBuilder:
         self._unsigned = bool((self.stream.speed >= 0).all())
         self.noise_groups = {self.name: self.default_sigma} if self.stream.sigma is None else {}
 
-    def add(self, step: Step, window: Window, previous: State | None, memory: Memory) -> None:
+    def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where one is due."""
         if not (len(window.dt) and due(window, self.config.period_s)):
             return
@@ -123,14 +124,14 @@ class WheelBuilder:
         if line is None:
             return
         speed, slope, sigma = line
-        ahead = self.body_R_vehicle[:, 0] @ step.predicted.attitude().matrix().T @ step.predicted.velocity()
+        ahead = self.body_R_vehicle[:, 0] @ update.predicted.attitude().matrix().T @ update.predicted.velocity()
         sign = -1.0 if self._unsigned and ahead < -REVERSING else 1.0
-        rate = (recent(window, window.gyro, RATE_S) - step.bias.gyroscope()) @ self.body_R_vehicle
-        data = np.array([sign * speed, sign * slope, *rate, sigma * memory.scale(self.name)])
+        rate = (recent(window, window.gyro, RATE_S) - update.bias.gyroscope()) @ self.body_R_vehicle
+        data = np.array([sign * speed, sign * slope, *rate, sigma * pass_state.scale(self.name)])
         prior = np.array([self.config.scale_sigma, self.config.delay_sigma])
-        wheel = step.use(SessionState("W", self.name, "wheel_scale_and_delay_s", np.zeros(2), prior))
-        keys = (key("X", step.index), key("V", step.index), step.use(mount_state(self.vehicle)), wheel)
-        step.blocks.append(Block(self.name, self.model, [keys], data[None], step.t_ns, loss=self.config.loss))
+        wheel = update.use(SessionState("W", self.name, "wheel_scale_and_delay_s", np.zeros(2), prior))
+        keys = (key("X", update.index), key("V", update.index), update.use(mount_state(self.vehicle)), wheel)
+        update.blocks.append(FactorBatch(self.name, self.model, [keys], data[None], update.t_ns, loss=self.config.loss))
 
     def _line(self, t_ns: int) -> tuple[float, float, float] | None:
         """Speed, slope and the sigma of the speed at one time; None where too few readings surround it."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from smartnav_graph import session
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers import (
     colmap,
     comma2k19,
@@ -25,7 +24,8 @@ from smartnav_graph.readers import (
 )
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.source import Reader
-from smartnav_graph.session import Session
+from smartnav_graph.session import session
+from smartnav_graph.session.session import Session
 
 READERS: dict[str, Reader] = {
     reader.name: reader
@@ -53,7 +53,7 @@ def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
     Parameters
     ----------
     source : session folder, or anything `read` takes
-    repairs : names of `smartnav_graph.repair` to apply beside those that session.toml asks for
+    repairs : names of `smartnav_graph.session.repair` to apply beside those that session.toml asks for
 
     Raises
     ------
@@ -97,7 +97,7 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
     ----------
     source : file, folder, zip or tar archive, or the literal ``gtsam-kitti`` / ``gtsam-euroc`` (in the gtsam package)
     name : format; by default recognised by content
-    repairs : names of `smartnav_graph.repair` to apply; what they touched is counted in `Session.dropped`
+    repairs : names of `smartnav_graph.session.repair` to apply; what they touched is counted in `Session.dropped`
 
     Raises
     ------

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 
 
 def is_archive(path: Path) -> bool:

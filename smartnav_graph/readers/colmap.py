@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import CalibrationError, SessionError
+from smartnav_graph.core.errors import CalibrationError, SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.kitti_odometry import NAV_R_CAMERA
 from smartnav_graph.readers.reference import pose_columns
 from smartnav_graph.readers.source import Reader, build_session, mount
 from smartnav_graph.readers.text import read_bytes
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Device, Session
 
 NAME = "colmap"
 

@@ -10,22 +10,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.timebase import ns_from_texts
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import Times, ns_from_texts
+from smartnav_graph.session.session import Device, Session
 
 NAME = "comma2k19"
 IMU = Path("processed_log", "IMU")
 FIXES = Path("processed_log", "GNSS", "live_gnss_ublox")
 SPEED = Path("processed_log", "CAN", "speed")
 POSE = Path("global_pose")
-
-Floats = NDArray[np.float64]
 
 
 def _matches(source: str) -> bool:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph import repair
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.source import Columns, Reader, build_session
 from smartnav_graph.readers.text import TextTable, read_text
-from smartnav_graph.session import Session, read_header
-from smartnav_graph.streams import STREAMS, Stream
+from smartnav_graph.session import repair
+from smartnav_graph.session.session import Session, read_header
+from smartnav_graph.session.streams import STREAMS, Stream
 
 NAME = "csv"
 

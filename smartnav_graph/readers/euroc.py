@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import CalibrationError, SessionError
+from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.readers.reference import euroc_columns
 from smartnav_graph.readers.source import Columns, Reader, build_session, mount, vector_columns
 from smartnav_graph.readers.text import read_bytes, read_text
-from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Device, Mount, Session
 
 NAME = "euroc"
 GRAVITY = 9.81

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.matlab import matrix, read_mat
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
 from smartnav_graph.readers.text import first_lines, read_text
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import NS
+from smartnav_graph.session.session import Device, Session
 
 NAME = "foot-dual-zupt"
 RATE_HZ = 60
@@ -30,8 +31,6 @@ FIRST_COLUMN = {"right": 0, "left": 6}
 POSITIONS = {"right": ("posFoot.mat", "posFoot"), "left": ("posLeft.mat", "posLeft")}
 HEADING = "time_index,acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z"
 WALKS = {"imuMeasLeft.csv": "left", "imuMeasRight.csv": "right"}
-
-Floats = NDArray[np.float64]
 
 
 def _split(source: str) -> tuple[Path, str]:

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.euroc import calibrated
 from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, mount, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
-from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Device, Mount, Session
 
 NAME = "gtsam-euroc"
 FILE = "eqvio_processed_30s.csv"

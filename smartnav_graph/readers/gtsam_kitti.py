@@ -10,7 +10,7 @@ from pathlib import Path
 
 from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
-from smartnav_graph.session import Device, Session
+from smartnav_graph.session.session import Device, Session
 
 NAME = "gtsam-kitti"
 IMU_FILE = "KittiEquivBiasedImu.txt"

@@ -22,13 +22,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, ImuNoise
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_bytes
-from smartnav_graph.session import Device, Session
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, ImuNoise
+from smartnav_graph.session.session import Device, Session
+from smartnav_graph.session.streams import Imu
 
 NAME = "indoor-waypoints"
 MS = NS // 1000

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.reference import pose_columns
 from smartnav_graph.readers.source import Columns, Reader, build_session, mount
 from smartnav_graph.readers.text import read_text
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Device, Session
 
 NAME = "kitti-odometry"
 PICTURES = ("image_0", "image_l")

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import SessionError
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
 
 
 def names_in(path: Path) -> frozenset[str]:

@@ -12,20 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.readers.matlab import matrix, names_in, read_mat
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import Times, ns_from_seconds
+from smartnav_graph.session.session import Device, Session
 
 NAME = "pyshoe"
 # Sigmas, metres: a foot's IMU is a shoe's width from the point it stands on; the floor's height was not measured.
 ON_THE_POINT = 0.1
 UNKNOWN_HEIGHT = 100.0
-
-Floats = NDArray[np.float64]
 
 
 def _matches(source: str) -> bool:

@@ -17,15 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.files import read_toml
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.files import read_toml
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Columns, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
-from smartnav_graph.session import build_stream, read_table
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
+from smartnav_graph.session.session import build_stream, read_table
+from smartnav_graph.session.streams import Reference
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 _POSITION = ("x", "y", "z")

@@ -10,9 +10,9 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Mount, Session, build_stream
-from smartnav_graph.streams import STREAMS, Stream
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.session import Mount, Session, build_stream
+from smartnav_graph.session.streams import STREAMS, Stream
 
 Columns = dict[str, NDArray[Any]]
 
@@ -46,7 +46,7 @@ class Reader:
         Parameters
         ----------
         source : file, folder or literal name
-        repairs : names of `smartnav_graph.repair`, applied to every stream and counted in `Session.dropped`
+        repairs : names of `smartnav_graph.session.repair`, applied to every stream and counted in `Session.dropped`
 
         Raises
         ------

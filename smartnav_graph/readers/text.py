@@ -17,10 +17,9 @@ import pyarrow.compute
 import pyarrow.csv
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.timebase import NS, Times, ns_from_text, ns_from_texts
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, ns_from_text, ns_from_texts
 
 
 def read_bytes(path: Path) -> bytes:

@@ -27,22 +27,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import STANDARD_GRAVITY
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.timebase import interpolate, nearest, ns_from_seconds, ns_from_text, seconds_since
 from smartnav_graph.readers.matlab import read_mat
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
 from smartnav_graph.readers.text import first_lines, read_bytes, read_text
-from smartnav_graph.session import Device, Session
-from smartnav_graph.timebase import Times, interpolate, nearest, ns_from_seconds, ns_from_text, seconds_since
+from smartnav_graph.session.session import Device, Session
 
 NAME = "tyrex"
 GRAVITY = 9.8056  # m/s^2, normal gravity at the hall near Grenoble (45.22 deg north, 250 m)
 SAME_STAMP_NS = 10_000  # stamps closer than this are one: what they are apart moves no reading
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -21,16 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.session import Mount
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Mount
+from smartnav_graph.session.streams import Images, Matches, Tracks
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
-from smartnav_graph.streams import Images, Matches, Tracks
-from smartnav_graph.timebase import NS
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 Rows = NDArray[np.intp]
 Range = tuple[float, float]
 

@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph import repair, session
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.files import replacing
-from smartnav_graph.progress import Progress, silent
-from smartnav_graph.session import Session
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.files import replacing
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.session import repair, session
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import GnssFix, Imu, Reference
 from smartnav_graph.simulation import fixes
 from smartnav_graph.simulation.fixes import Outliers
-from smartnav_graph.streams import GnssFix, Imu, Reference
 
-Floats = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
 
 _FAULTS = ("gnss_white", "gnss_gm", "outliers", "jitter", "rows", "nan")

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.frames import LocalFrame
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import LocalFrame
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.streams import ControlPoint, GnssFix, PoseFix
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 AXES = np.array([1.0, 1.0, 1.5])
 BURST_S = (4.0, 9.0)

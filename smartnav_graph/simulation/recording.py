@@ -16,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import frames
-from smartnav_graph import session as session_model
-from smartnav_graph.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.files import replacing
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.progress import Progress, silent
-from smartnav_graph.session import Device, Mount, Session
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.files import replacing
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.session import session as session_model
+from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
+from smartnav_graph.session.session import Device, Mount, Session
+from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
 from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import CameraModel
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
-from smartnav_graph.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 START_NS = 1_748_772_000 * NS  # 2025-06-01 10:00 UTC

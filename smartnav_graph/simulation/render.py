@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.progress import Progress, silent
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation.cameras import CameraModel, PictureModel, file_name
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 # Metres across the patches of a texture, from a piece of furniture to the smallest print.

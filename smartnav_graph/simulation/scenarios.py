@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.session import Mount, Session
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.cameras import LOOKING_AHEAD, CameraModel, Faults, PictureModel
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 # Share of the way to a point within which another face hides it; the point itself lies on a face.

@@ -13,16 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
-from smartnav_graph.frames import STANDARD_GRAVITY
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
+from smartnav_graph.session.streams import Barometer, Imu, Magnetometer, Velocity, WheelSpeed
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.streams import Barometer, Imu, Magnetometer, Velocity, WheelSpeed
-from smartnav_graph.timebase import NS
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
 
-Floats = NDArray[np.float64]
 Angle = tuple[int, Floats, Floats]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)

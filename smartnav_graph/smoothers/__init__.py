@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from smartnav_graph.graph import State, Step
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.fixed_lag import FixedLag
 from smartnav_graph.smoothers.incremental import Incremental, ReplayConfig
@@ -18,7 +19,7 @@ class Smoother(Protocol):
         """State at the last keyframe, None before the first."""
         ...
 
-    def update(self, step: Step) -> None:
+    def update(self, update: GraphUpdate) -> None:
         """Take one step."""
         ...
 

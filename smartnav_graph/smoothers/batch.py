@@ -11,8 +11,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, State, Step, key
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, State, key
+from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.estimate import (
     Estimate,
     Posterior,
@@ -77,11 +78,11 @@ class Batch:
 
     config: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
-    warm: Any = None
+    initial_values: Any = None
     t0_ns: int = 0
-    unsure: bool = False
+    coarse_start: bool = False
     first_s: float = 0.0
-    steps: list[Step] = field(default_factory=list)
+    steps: list[GraphUpdate] = field(default_factory=list)
     values: Any = field(default_factory=gtsam.Values)
     _settled: int = 0
     _stretch_s: float = 0.0
@@ -90,7 +91,9 @@ class Batch:
     _recent: Any = field(default_factory=gtsam.Values)
 
     def __post_init__(self) -> None:
-        self._stretch_s = min(2.0, self.config.settle_s) if self.unsure else max(self.config.settle_s, self.first_s)
+        self._stretch_s = (
+            min(2.0, self.config.settle_s) if self.coarse_start else max(self.config.settle_s, self.first_s)
+        )
 
     def latest(self) -> State | None:
         """Latest state: of the warm values, of the last settled stretch, or predicted since then."""
@@ -98,29 +101,29 @@ class Batch:
             return None
         return state_at(self.values, self.steps[-1].index, self.steps[-1].t_ns)
 
-    def update(self, step: Step) -> None:
+    def update(self, update: GraphUpdate) -> None:
         """Take one step; settle the latest stretch when it is long enough."""
-        self.steps.append(step)
-        for name, state in step.session.items():
+        self.steps.append(update)
+        for name, state in update.session.items():
             if not self.values.exists(name):
-                known = self.warm is not None and self.warm.exists(name)
-                self.values.insert(name, self.warm.atVector(name) if known else state.initial)
-        if self.warm is not None:
-            copy_state(step, self.warm, self.values)
+                known = self.initial_values is not None and self.initial_values.exists(name)
+                self.values.insert(name, self.initial_values.atVector(name) if known else state.initial)
+        if self.initial_values is not None:
+            copy_state(update, self.initial_values, self.values)
             return
-        new = step.values()
+        new = update.values()
         self.values.insert(new)
         self._recent.insert(new)
-        self._share(step, self._recent)
-        since = step.t_s - self.steps[self._settled].t_s
+        self._share(update, self._recent)
+        since = update.t_s - self.steps[self._settled].t_s
         if since >= self._stretch_s:
             begin = time.perf_counter()
             self._settle(since)
             self._settle_s += time.perf_counter() - begin
 
-    def _share(self, step: Step, values: Any) -> None:
+    def _share(self, update: GraphUpdate, values: Any) -> None:
         """Give `values` the present session states of a step, where it lacks them."""
-        for name in step.session:
+        for name in update.session:
             if not values.exists(name):
                 values.insert(name, self.values.atVector(name))
 
@@ -131,11 +134,11 @@ class Batch:
         dead-reckoned guess away before there are enough fixes to stop it.
         """
         stretch = self.steps[self._settled :]
-        growing = self.unsure and self._settled == 0 and self._stretch_s < self.config.settle_s
+        growing = self.coarse_start and self._settled == 0 and self._stretch_s < self.config.settle_s
         try:
             solve = self._solve_stretch(stretch, self._recent, since)
             if solve.cost > BAD_COST * len(stretch) and len(stretch) > GROW_FROM:
-                solve = min(solve, self._grown(stretch, since), key=lambda s: s.cost)
+                solve = min(solve, self._lengthened(stretch, since), key=lambda s: s.cost)
             if not growing:
                 graph = self._stretch_graph(stretch, since)
                 tree = _eliminate(graph.linearize(solve.values), self._order(stretch))
@@ -158,7 +161,7 @@ class Batch:
         shortest, longest = SHORTEST_STRETCH * self.config.settle_s, self.config.longest_settle_s
         return float(np.clip(LARGEST_TURN / np.sqrt(bias.max()), shortest, longest))
 
-    def _stretch_graph(self, stretch: Sequence[Step], since: float) -> WholeGraph:
+    def _stretch_graph(self, stretch: Sequence[GraphUpdate], since: float) -> WholeGraph:
         """Factors of a stretch, held at its beginning."""
         first = stretch[0] is self.steps[0]
         graph = WholeGraph.of(stretch if first else stretch[1:])
@@ -170,7 +173,7 @@ class Batch:
             graph.native.push_back(_hold(self.steps[0]))
         return graph
 
-    def _order(self, stretch: Sequence[Step]) -> gtsam.Ordering:
+    def _order(self, stretch: Sequence[GraphUpdate]) -> gtsam.Ordering:
         """Keyframes of a stretch, then the session states that its factors touch: not those of its first step, which
         the anchor stands for."""
         order, touched = gtsam.Ordering(), stretch if stretch[0] is self.steps[0] else stretch[1:]
@@ -178,12 +181,12 @@ class Batch:
             order.push_back(name)
         return order
 
-    def _solve_stretch(self, stretch: Sequence[Step], values: Any, since: float) -> Solve:
+    def _solve_stretch(self, stretch: Sequence[GraphUpdate], values: Any, since: float) -> Solve:
         graph, order = self._stretch_graph(stretch, since), self._order(stretch)
-        enough = 0.0 if self.unsure else GOOD_COST * len(stretch)
+        enough = 0.0 if self.coarse_start else GOOD_COST * len(stretch)
         return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate), enough)
 
-    def _grown(self, stretch: Sequence[Step], since: float) -> Solve:
+    def _lengthened(self, stretch: Sequence[GraphUpdate], since: float) -> Solve:
         """Solve a stretch from its beginning in doubling parts, each foretold from the part before."""
         values, size, solve = gtsam.Values(), GROW_FROM, None
         copy_state(stretch[0], self._recent, values)
@@ -204,7 +207,7 @@ class Batch:
         fresh = [step.refreshed(values.atConstantBias(key("B", before.index))) for before, step in pairwise(self.steps)]
         return any(fresh)
 
-    def _shoot(self, candidate: Any) -> Any:
+    def _reintegrate(self, candidate: Any) -> Any:
         return _shot(self.steps, candidate)
 
     def estimate(self) -> Estimate:
@@ -220,7 +223,7 @@ class Batch:
             graph, solve = self._solved(self.solve)
             solved = time.perf_counter()
             marginals = posterior(eliminated(graph, solve.values, self.steps), self.steps)
-            covariance = marginals.nav(states_of(solve.values, [step.index for step in self.steps])[0])
+            covariance = marginals.nav(states_of(solve.values, [update.index for update in self.steps])[0])
         except RuntimeError as error:
             raise self._explain(error) from error
         check_covariance(covariance, self.steps, self.t0_ns)
@@ -239,20 +242,20 @@ class Batch:
         blank = {name: np.zeros((len(state.initial),) * 2) for name, state in session_states(self.steps).items()}
         return self._told(solve, none, Posterior(none, none[1:], blank), {})
 
-    def renewed(self, renew: Callable[[Step], None]) -> None:
+    def renewed(self, renew: Callable[[GraphUpdate], None]) -> None:
         """Change what the steps add; a session state that comes with it begins at its prior mean."""
-        for step in self.steps:
-            renew(step)
-            for name, state in step.session.items():
+        for update in self.steps:
+            renew(update)
+            for name, state in update.session.items():
                 if not self.values.exists(name):
                     self.values.insert(name, state.initial)
 
     def _solved(self, precision: SolveConfig) -> tuple[WholeGraph, Solve]:
         """Everything solved from the present values, which then are the solution."""
-        order, shoot = chronological_order(self.steps), self._shoot if self.unsure else None
+        order, reintegrate = chronological_order(self.steps), self._reintegrate if self.coarse_start else None
         graph = WholeGraph.of(self.steps)
-        solve = minimise(graph, self.values, order, precision, shoot)
-        if not self.unsure and self._refresh(solve.values):
+        solve = minimise(graph, self.values, order, precision, reintegrate)
+        if not self.coarse_start and self._refresh(solve.values):
             graph = WholeGraph.of(self.steps)
             solve = minimise(graph, solve.values, order, precision)
         self.values = solve.values
@@ -261,11 +264,11 @@ class Batch:
     def _told(self, solve: Solve, covariance: Any, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
         return Estimate(
             values=solve.values,
-            indices=[step.index for step in self.steps],
-            t_ns=np.array([step.t_ns for step in self.steps], dtype=np.int64),
+            indices=[update.index for update in self.steps],
+            t_ns=np.array([update.t_ns for update in self.steps], dtype=np.int64),
             covariance=covariance,
-            factors=[item for step in self.steps for item in step.factors],
-            blocks=[block for step in self.steps for block in step.blocks],
+            factors=[item for update in self.steps for item in update.factors],
+            blocks=[block for update in self.steps for block in update.blocks],
             iterations=solve.iterations,
             converged=solve.converged,
             cost=solve.cost,
@@ -275,37 +278,37 @@ class Batch:
         )
 
     def _explain(self, error: RuntimeError) -> SolverError:
-        t_ns = {step.index: step.t_ns for step in self.steps}
-        touching = {step.index: step.sensors() for step in self.steps}
+        t_ns = {update.index: update.t_ns for update in self.steps}
+        touching = {update.index: update.sensors() for update in self.steps}
         return indeterminate(error, t_ns, self.t0_ns, touching)
 
 
-def _hold(step: Step) -> Any:
+def _hold(update: GraphUpdate) -> Any:
     """Keeps the attitude of the first keyframe near its guess: seconds of noisy fixes say nothing of it."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, 0.2)
-    return gtsam.PoseRotationPrior3D(key("X", step.index), step.predicted.attitude(), model)
+    return gtsam.PoseRotationPrior3D(key("X", update.index), update.predicted.attitude(), model)
 
 
-def _place(step: Step) -> Any:
+def _place(update: GraphUpdate) -> Any:
     """Keeps the first keyframe within kilometres of its guess: before the first fix nothing else says where it is, and
     a solve would leave it a million of them away."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, PLACE_M)
-    return gtsam.GPSFactor(key("X", step.index), step.predicted.position(), model)
+    return gtsam.GPSFactor(key("X", update.index), update.predicted.position(), model)
 
 
-def _shot(steps: Sequence[Step], values: Any) -> Any:
+def _shot(steps: Sequence[GraphUpdate], values: Any) -> Any:
     """The states that the first one foretells, all with its bias."""
     state = state_at(values, steps[0].index, steps[0].t_ns)
     nav, bias = state.nav, state.bias
-    shot = gtsam.Values(values)
-    for step in steps[1:]:
-        if step.foretell is None:
+    reintegrated = gtsam.Values(values)
+    for update in steps[1:]:
+        if update.predict is None:
             return values
-        nav = step.foretell(nav, bias)
-        shot.update(key("X", step.index), nav.pose())
-        shot.update(key("V", step.index), nav.velocity())
-        shot.update(key("B", step.index), bias)
-    return shot
+        nav = update.predict(nav, bias)
+        reintegrated.update(key("X", update.index), nav.pose())
+        reintegrated.update(key("V", update.index), nav.velocity())
+        reintegrated.update(key("B", update.index), bias)
+    return reintegrated
 
 
 def _eliminate(linear: Any, order: gtsam.Ordering) -> Any:
@@ -315,22 +318,22 @@ def _eliminate(linear: Any, order: gtsam.Ordering) -> Any:
         return linear.eliminateMultifrontal(order, gtsam.EliminateQR)
 
 
-def _anchor(tree: Any, values: Any, step: Step) -> Any:
+def _anchor(tree: Any, values: Any, update: GraphUpdate) -> Any:
     """Prior factors that stand for everything up to `step`."""
     graph = gtsam.NonlinearFactorGraph()
-    pose, velocity, bias = (key(letter, step.index) for letter in KEYFRAME_LETTERS)
+    pose, velocity, bias = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
 
     def model(name: int) -> Any:
         return gtsam.noiseModel.Gaussian.Covariance(ANCHOR_SLACK * tree.marginalCovariance(name))
 
     graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), model(pose)))
     graph.add(gtsam.PriorFactorConstantBias(bias, values.atConstantBias(bias), model(bias)))
-    for name in (velocity, *step.chain):
+    for name in (velocity, *update.chain):
         graph.add(gtsam.PriorFactorVector(name, values.atVector(name), model(name)))
     return graph
 
 
-def check_covariance(covariance: Any, steps: Sequence[Step], t0_ns: int) -> None:
+def check_covariance(covariance: Any, steps: Sequence[GraphUpdate], t0_ns: int) -> None:
     """Observability: every variance finite and positive, position known better than `LARGEST_VARIANCE`.
 
     Raises

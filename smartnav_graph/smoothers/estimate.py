@@ -12,11 +12,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, Block, SessionState, State, Step, Tag, key, kind_of
-from smartnav_graph.smoothers.whole_graph import Stack, stacks_of
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SolverError
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
+from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.smoothers.whole_graph import StackedFactors, stacks_of
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class Estimate:
     indices: Sequence[int]
     t_ns: NDArray[np.int64]
     covariance: Floats
-    factors: Sequence[tuple[Tag, Any]]
-    blocks: Sequence[Block]
+    factors: Sequence[tuple[FactorId, Any]]
+    blocks: Sequence[FactorBatch]
     iterations: int
     converged: bool
     cost: float
@@ -93,14 +93,14 @@ class Estimate:
         place = np.clip(np.searchsorted(self.t_ns, t_ns - merge_ns), 0, len(self.t_ns) - 1)
         return place, np.abs(self.t_ns[place] - t_ns) <= merge_ns
 
-    def stacks(self, sensor: str) -> list[Stack]:
-        """The blocks of one sensor, joined; see `Stack.linearize` for their residuals."""
+    def stacks(self, sensor: str) -> list[StackedFactors]:
+        """The blocks of one sensor, joined; see `StackedFactors.linearize` for their residuals."""
         return self._stacks.get(sensor, [])
 
     @cached_property
-    def _stacks(self) -> Mapping[str, list[Stack]]:
+    def _stacks(self) -> Mapping[str, list[StackedFactors]]:
         held = {state.key: state.value for state in self.session.values() if state.held}
-        found: dict[str, list[Stack]] = {}
+        found: dict[str, list[StackedFactors]] = {}
         for stack in stacks_of(self.blocks, held):
             found.setdefault(stack.blocks[0].sensor, []).append(stack)
         return found
@@ -122,13 +122,13 @@ def state_at(values: Any, index: int, t_ns: int) -> State:
     )
 
 
-def copy_state(step: Step, source: Any, target: Any) -> None:
+def copy_state(update: GraphUpdate, source: Any, target: Any) -> None:
     """Copy the variables of one step from gtsam.Values to gtsam.Values."""
-    x, v, b = (key(letter, step.index) for letter in KEYFRAME_LETTERS)
+    x, v, b = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
     target.insert(x, source.atPose3(x))
     target.insert(v, source.atVector(v))
     target.insert(b, source.atConstantBias(b))
-    for name, initial in step.chain.items():
+    for name, initial in update.chain.items():
         target.insert(name, source.atVector(name) if source.exists(name) else initial)
 
 
@@ -166,31 +166,31 @@ def distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, flo
     return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
 
 
-def session_states(steps: Iterable[Step]) -> dict[int, SessionState]:
+def session_states(steps: Iterable[GraphUpdate]) -> dict[int, SessionState]:
     """The free session states that steps touch, by key."""
     found: dict[int, SessionState] = {}
-    for step in steps:
-        found |= step.session
+    for update in steps:
+        found |= update.session
     return found
 
 
-def chronological_order(steps: Sequence[Step]) -> gtsam.Ordering:
+def chronological_order(steps: Sequence[GraphUpdate]) -> gtsam.Ordering:
     """Keyframes as they come, then what they all share: the cheapest elimination of a chain."""
     order = gtsam.Ordering()
-    for step in steps:
-        for name in step.names():
+    for update in steps:
+        for name in update.names():
             order.push_back(name)
     for name in session_states(steps):
         order.push_back(name)
     return order
 
 
-def eliminated(graph: Any, values: Any, steps: Sequence[Step]) -> Any:
+def eliminated(graph: Any, values: Any, steps: Sequence[GraphUpdate]) -> Any:
     """Bayes net of a graph linearised at `values`, in chronological order; QR is exact where states are weakly held."""
     return graph.linearize(values).eliminateSequential(chronological_order(steps), gtsam.EliminateQR)
 
 
-def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
+def posterior(net: Any, steps: Sequence[GraphUpdate]) -> Posterior:
     """Marginals by recursion over a Bayes net eliminated in chronological order, session states last.
 
     Each keyframe is conditioned on what comes later, R x_k + S y = d; backwards in time P_k = R^-1 R^-T + K P_y K^T
@@ -205,7 +205,7 @@ def posterior(net: Any, steps: Sequence[Step]) -> Posterior:
         A keyframe is not determined.
     """
     conditionals = {net.at(i).keys()[0]: net.at(i) for i in range(net.size())}
-    groups = [step.names() for step in steps]
+    groups = [update.names() for update in steps]
     last_use = _earliest_users(groups, conditionals)
     session = list(session_states(steps))
     live, later = _Joint.empty(), {}
@@ -307,16 +307,16 @@ def _slices(names: Iterable[int]) -> dict[int, slice]:
     return at
 
 
-def session_values(steps: Sequence[Step], values: Any, marginals: Posterior) -> dict[str, SessionValue]:
+def session_values(steps: Sequence[GraphUpdate], values: Any, marginals: Posterior) -> dict[str, SessionValue]:
     """What was found of every session state, by name."""
     found = {}
-    for step in steps:
-        for name, state in step.session.items():
+    for update in steps:
+        for name, state in update.session.items():
             if state.name not in found:
                 value, cov = values.atVector(name), marginals.session[name]
                 found[state.name] = SessionValue(state.name, name, value, cov, state.initial, state.sigma, False)
-        for name, state in step.constants.items():
-            none, value = np.zeros((len(state.initial),) * 2), step.held[name]
+        for name, state in update.constants.items():
+            none, value = np.zeros((len(state.initial),) * 2), update.held[name]
             found[state.name] = SessionValue(state.name, name, value, none, state.initial, state.sigma, True)
     return found
 

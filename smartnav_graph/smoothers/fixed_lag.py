@@ -17,14 +17,14 @@ from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.graph import KEYFRAME_LETTERS, Block, SessionState, State, Step, key, kind_of
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
 from smartnav_graph.smoothers.estimate import copy_state, latest_covariance, state_at
 from smartnav_graph.smoothers.incremental import Effort, Incremental, ReplayConfig, scalars
 from smartnav_graph.smoothers.whole_graph import WholeGraph, session_prior
 
-Floats = NDArray[np.float64]
 Item = TypeVar("Item")
 
 # Sigmas of position (m) and attitude (rad) beyond which QR is needed.
@@ -45,62 +45,62 @@ class FixedLag(Incremental):
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         super().__init__(config, t0_ns)
-        self._inside: deque[Step] = deque()
+        self._inside: deque[GraphUpdate] = deque()
         self._session: dict[int, SessionState] = {}
         self._held: dict[int, Floats] = {}
         self._factors: list[tuple[int, Any]] = []
-        self._blocks: list[tuple[int, Block]] = []
+        self._blocks: list[tuple[int, FactorBatch]] = []
         self._live, self._left = gtsam.Values(), gtsam.Values()
         self._net: Any = None
         self._weak = True
 
-    def _take(self, step: Step) -> None:
-        self._make_room(step)
-        self._drop_late(step)
-        self._insert(step)
+    def _take(self, update: GraphUpdate) -> None:
+        self._make_room(update)
+        self._drop_late(update)
+        self._insert(update)
         graph = WholeGraph((f for _, f in self._factors), (b for _, b in self._blocks), self._held)
         order = self._order()
         names = list(self._live.keys())
-        trust = np.concatenate([kind_of(name).trust for name in names])
+        damping_scale = np.concatenate([kind_of(name).damping_scale for name in names])
         for count in range(1, MOST_STEPS + 1):
             self._net = _eliminated(graph.linearize(self._live), order, self._weak)
             delta = self._net.optimize()
             _check(delta, names)
             self._live = self._live.retract(delta)
             self.effort = Effort(len(names), count * len(names))
-            if (np.abs(delta.vector()) < SETTLED * self.config.relinearize * trust).all():
+            if (np.abs(delta.vector()) < SETTLED * self.config.relinearize * damping_scale).all():
                 break
 
-    def _insert(self, step: Step) -> None:
+    def _insert(self, update: GraphUpdate) -> None:
         """Make the step's states and factors live; a session state comes with its prior, once."""
-        self._inside.append(step)
-        self._live.insert(step.values())
-        self._held |= step.held
-        for name, state in step.session.items():
+        self._inside.append(update)
+        self._live.insert(update.values())
+        self._held |= update.held
+        for name, state in update.session.items():
             if name not in self._session:
                 self._live.insert(name, state.initial)
                 self._factors.append((NEVER, session_prior(state)))
-        self._session |= step.session
-        self._factors += [(_oldest(factor.keys()), factor) for _, factor in step.factors]
-        for block in step.blocks:
+        self._session |= update.session
+        self._factors += [(_oldest(factor.keys()), factor) for _, factor in update.factors]
+        for block in update.blocks:
             self._blocks += _parted(block)
 
-    def _drop_late(self, step: Step) -> None:
+    def _drop_late(self, update: GraphUpdate) -> None:
         """Leave out, and count, rows that speak of keyframes which have left the lag."""
-        oldest = self._inside[0].index if self._inside else step.index
+        oldest = self._inside[0].index if self._inside else update.index
         kept = []
-        for block in step.blocks:
+        for block in update.blocks:
             gone = [_oldest(keys) < oldest for keys in block.keys]
             if any(gone):
                 self.dropped[block.sensor] += sum(gone)
                 block = _only(block, [not late for late in gone])
             kept.append(block)
-        step.blocks = kept
+        update.blocks = kept
 
-    def _make_room(self, step: Step) -> None:
+    def _make_room(self, update: GraphUpdate) -> None:
         """Marginalise the keyframes that are older than the lag, and keep their last estimate."""
         leaving = []
-        while self._inside and self._inside[0].t_s < step.t_s - self.config.lag_s:
+        while self._inside and self._inside[0].t_s < update.t_s - self.config.lag_s:
             leaving.append(self._inside.popleft())
         if not leaving:
             return
@@ -134,11 +134,11 @@ class FixedLag(Incremental):
             order.push_back(name)
         return order
 
-    def _state(self, step: Step) -> State:
-        return state_at(self._live, step.index, step.t_ns)
+    def _state(self, update: GraphUpdate) -> State:
+        return state_at(self._live, update.index, update.t_ns)
 
-    def _marginal(self, step: Step) -> Floats:
-        joint = latest_covariance(self._net, _own(step))
+    def _marginal(self, update: GraphUpdate) -> Floats:
+        joint = latest_covariance(self._net, _own(update))
         sigma = np.sqrt(np.diag(joint))
         self._weak = not (sigma[:3].max() < WEAK_RAD and sigma[3:6].max() < WEAK_M)
         return joint
@@ -162,9 +162,9 @@ class FixedLag(Incremental):
         return values
 
 
-def _own(step: Step) -> list[int]:
+def _own(update: GraphUpdate) -> list[int]:
     """States of the body at one keyframe."""
-    return [key(letter, step.index) for letter in KEYFRAME_LETTERS]
+    return [key(letter, update.index) for letter in KEYFRAME_LETTERS]
 
 
 def _eliminated(linear: Any, order: gtsam.Ordering, weak: bool) -> Any:
@@ -193,7 +193,7 @@ def _split(items: Sequence[tuple[int, Item]], last: int) -> tuple[list[Item], li
     return [item for oldest, item in items if oldest <= last], [pair for pair in items if pair[0] > last]
 
 
-def _only(block: Block, mask: Sequence[bool]) -> Block:
+def _only(block: FactorBatch, mask: Sequence[bool]) -> FactorBatch:
     """The rows (m,) of a block that a mask leaves."""
     rows = [i for i, kept in enumerate(mask) if kept]
     return replace(
@@ -205,7 +205,7 @@ def _only(block: Block, mask: Sequence[bool]) -> Block:
     )
 
 
-def _parted(block: Block) -> list[tuple[int, Block]]:
+def _parted(block: FactorBatch) -> list[tuple[int, FactorBatch]]:
     """A block in parts of rows that share their oldest keyframe; rows not used stay out."""
     oldest = [_oldest(keys) if used else None for keys, used in zip(block.keys, block.used, strict=True)]
     return [(index, _only(block, [o == index for o in oldest])) for index in dict.fromkeys(oldest) if index is not None]

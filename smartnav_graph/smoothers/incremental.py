@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import SessionState, State, Step
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.graph.states import SessionState, State
+from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.estimate import (
     Estimate,
     eliminated,
@@ -22,8 +24,6 @@ from smartnav_graph.smoothers.estimate import (
     to_nav_axes,
 )
 from smartnav_graph.smoothers.whole_graph import WholeGraph
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -58,20 +58,20 @@ class Incremental(ABC):
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         self.config, self.t0_ns = config, t0_ns
-        self.steps: list[Step] = []
+        self.steps: list[GraphUpdate] = []
         self.dropped: Counter[str] = Counter()
         self.effort = Effort()
 
     @abstractmethod
-    def _take(self, step: Step) -> None:
+    def _take(self, update: GraphUpdate) -> None:
         """Solve with one step more; RuntimeError where a state is not determined."""
 
     @abstractmethod
-    def _state(self, step: Step) -> State:
+    def _state(self, update: GraphUpdate) -> State:
         """Present estimate at one keyframe."""
 
     @abstractmethod
-    def _marginal(self, step: Step) -> Floats:
+    def _marginal(self, update: GraphUpdate) -> Floats:
         """(15, 15) covariance of the latest keyframe on GTSAM's tangents."""
 
     @abstractmethod
@@ -85,14 +85,14 @@ class Incremental(ABC):
     def recent(self) -> tuple[NDArray[np.int64], Floats]:
         """Stamps (m,) and present positions (m, 3) of the keyframes of the last `lag_s`, in time order."""
         found = []
-        for step in reversed(self.steps):
-            if step.t_s < self.steps[-1].t_s - self.config.lag_s:
+        for update in reversed(self.steps):
+            if update.t_s < self.steps[-1].t_s - self.config.lag_s:
                 break
-            found.append((step.t_ns, self._state(step).nav.position()))
+            found.append((update.t_ns, self._state(update).nav.position()))
         t_ns, position = zip(*reversed(found), strict=True)
         return np.array(t_ns, dtype=np.int64), np.array(position)
 
-    def update(self, step: Step) -> None:
+    def update(self, update: GraphUpdate) -> None:
         """Take one step.
 
         Raises
@@ -101,12 +101,12 @@ class Incremental(ABC):
             The new state is not determined; names time, state and sensors.
         """
         try:
-            self._take(step)
+            self._take(update)
         except RuntimeError as error:
-            t_ns = {s.index: s.t_ns for s in [*self.steps, step]}
-            touching = {s.index: s.sensors() for s in [*self.steps, step]}
+            t_ns = {s.index: s.t_ns for s in [*self.steps, update]}
+            touching = {s.index: s.sensors() for s in [*self.steps, update]}
             raise indeterminate(error, t_ns, self.t0_ns, touching) from error
-        self.steps.append(step)
+        self.steps.append(update)
 
     def latest(self) -> State | None:
         """State at the last keyframe, with everything known so far."""
@@ -125,15 +125,15 @@ class Incremental(ABC):
         steps = self.steps[:count]
         if not steps:
             raise SolverError("replay", "no keyframe was processed", "at least one")
-        graph, values, indices = WholeGraph.of(steps), self.values(), [step.index for step in steps]
+        graph, values, indices = WholeGraph.of(steps), self.values(), [update.index for update in steps]
         marginals = posterior(eliminated(graph, values, steps), steps)
         return Estimate(
             values=values,
             indices=indices,
-            t_ns=np.array([step.t_ns for step in steps], dtype=np.int64),
+            t_ns=np.array([update.t_ns for update in steps], dtype=np.int64),
             covariance=marginals.nav(states_of(values, indices)[0]),
-            factors=[item for step in steps for item in step.factors],
-            blocks=[block for step in steps for block in step.blocks],
+            factors=[item for update in steps for item in update.factors],
+            blocks=[block for update in steps for block in update.blocks],
             iterations=len(steps),
             converged=True,
             cost=graph.error(values),

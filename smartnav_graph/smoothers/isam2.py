@@ -12,21 +12,20 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from smartnav_graph.graph import KEYFRAME_LETTERS, STATES, SessionState, State, Step, key
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, SessionState, State, key
+from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.incremental import Effort, Incremental, ReplayConfig, scalars
 from smartnav_graph.smoothers.whole_graph import custom_factor, session_prior
-
-Floats = NDArray[np.float64]
 
 
 def isam2_params(factor: float) -> gtsam.ISAM2Params:
     """iSAM2 with QR and relinearisation at every step that needs it."""
     thresholds = gtsam.ISAM2ThresholdMap()
     for letter, kind in STATES.items():
-        thresholds.insert((letter, factor * kind.moved))
+        thresholds.insert((letter, factor * kind.relinearize_threshold))
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.setRelinearizeThreshold(thresholds)
@@ -42,33 +41,33 @@ class Isam2(Incremental):
         self._engine = gtsam.ISAM2(isam2_params(config.relinearize))
         self._session: dict[int, SessionState] = {}
 
-    def _take(self, step: Step) -> None:
+    def _take(self, update: GraphUpdate) -> None:
         if self.config.hold:
-            step.hold({state.name: state.initial for state in step.session.values()})
-        graph, values = gtsam.NonlinearFactorGraph(), step.values()
-        for _, factor in step.factors:
+            update.hold({state.name: state.initial for state in update.session.values()})
+        graph, values = gtsam.NonlinearFactorGraph(), update.values()
+        for _, factor in update.factors:
             graph.push_back(factor)
-        for block in step.blocks:
+        for block in update.blocks:
             for row in np.flatnonzero(block.used):
-                graph.push_back(custom_factor(block, int(row), step.held))
-        for name, state in step.session.items():
+                graph.push_back(custom_factor(block, int(row), update.held))
+        for name, state in update.session.items():
             if name not in self._session:
                 values.insert(name, state.initial)
                 graph.push_back(session_prior(state))
-        self._session |= step.session
+        self._session |= update.session
         done = self._engine.update(graph, values)
         self.effort = Effort(done.getVariablesReeliminated(), done.getVariablesRelinearized())
 
-    def _state(self, step: Step) -> State:
-        i, engine = step.index, self._engine
+    def _state(self, update: GraphUpdate) -> State:
+        i, engine = update.index, self._engine
         pose = engine.calculateEstimatePose3(key("X", i))
         velocity = engine.calculateEstimateVector(key("V", i))
-        return State(i, step.t_ns, gtsam.NavState(pose, velocity), engine.calculateEstimateConstantBias(key("B", i)))
+        return State(i, update.t_ns, gtsam.NavState(pose, velocity), engine.calculateEstimateConstantBias(key("B", i)))
 
-    def _marginal(self, step: Step) -> Floats:
+    def _marginal(self, update: GraphUpdate) -> Floats:
         """Blocks of pose, velocity and bias alone: the engine gives no more."""
         return np.asarray(
-            block_diag(*(self._engine.marginalCovariance(key(letter, step.index)) for letter in KEYFRAME_LETTERS))
+            block_diag(*(self._engine.marginalCovariance(key(letter, update.index)) for letter in KEYFRAME_LETTERS))
         )
 
     def session_now(self) -> dict[str, tuple[float, float]]:

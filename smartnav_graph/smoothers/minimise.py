@@ -17,8 +17,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import STATES, kind_of
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.graph.states import STATES, kind_of
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ def minimise(
     values: Any,
     order: gtsam.Ordering,
     config: SolveConfig,
-    shoot: Callable[[Any], Any] | None = None,
+    reintegrate: Callable[[Any], Any] | None = None,
     enough: float = 0.0,
 ) -> Solve:
     """Levenberg-Marquardt with Gauss-Newton steps first; ends at once at a cost of `enough`.
 
-    `shoot` replaces the states of a candidate by those its first state foretells. Where a step fails only because
+    `reintegrate` replaces the states of a candidate by those its first state foretells. Where a step fails only because
     rotations far along the stretch turn on curves (an unknown gyro bias), the shot lands on the valley's floor.
 
     Raises
@@ -81,7 +81,7 @@ def minimise(
     cost = graph.error(values)
     if not np.isfinite(cost):
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
-    trust = np.concatenate([kind_of(name).trust for name in list(values.keys())])
+    damping_scale = np.concatenate([kind_of(name).damping_scale for name in list(values.keys())])
     damping, iterations, converged, flat = 0.0, 0, False, 0
     recent = deque([cost], RECENT)
     while iterations < config.max_iterations and not converged:
@@ -89,13 +89,13 @@ def minimise(
         linear = graph.linearize(values)
         while True:
             delta = _step(linear, order, damping)
-            candidate, new_cost = _better(graph, values.retract(delta), cost, shoot)
+            candidate, new_cost = _better(graph, values.retract(delta), cost, reintegrate)
             if new_cost <= (cost if damping else max(recent)) * (1 + 1e-9) + 1e-12:
                 break
             damping = max(10.0 * damping, 1e-2)
             if damping > 1e10:
                 return Solve(values, cost, iterations, _stationary(linear, order))
-        small = float((np.abs(delta.vector()) / trust).max()) < config.step_tolerance
+        small = float((np.abs(delta.vector()) / damping_scale).max()) < config.step_tolerance
         flat = flat + 1 if abs(cost - new_cost) <= config.tolerance * max(new_cost, 1.0) else 0
         converged = new_cost <= enough or (damping <= 1.0 and flat > 0 and (small or flat >= FLAT))
         values, cost, damping = candidate, new_cost, damping / 10.0 if damping > 1e-2 else 0.0
@@ -103,14 +103,14 @@ def minimise(
     return Solve(values, cost, iterations, converged)
 
 
-def _better(graph: Any, candidate: Any, cost: float, shoot: Callable[[Any], Any] | None) -> tuple[Any, float]:
+def _better(graph: Any, candidate: Any, cost: float, reintegrate: Callable[[Any], Any] | None) -> tuple[Any, float]:
     """The candidate, or its shot where the candidate does not lower the cost; infinite where that is not finite."""
     own = graph.error(candidate)
-    if shoot is None or own < cost:
+    if reintegrate is None or own < cost:
         return candidate, own if np.isfinite(own) else np.inf
-    shot = shoot(candidate)
-    other = graph.error(shot)
-    costs = [(c, v) for c, v in ((own, candidate), (other, shot)) if np.isfinite(c)]
+    reintegrated = reintegrate(candidate)
+    other = graph.error(reintegrated)
+    costs = [(c, v) for c, v in ((own, candidate), (other, reintegrated)) if np.isfinite(c)]
     new_cost, best = min(costs, key=lambda item: item[0], default=(np.inf, candidate))
     return best, new_cost
 
@@ -119,7 +119,11 @@ def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
     if damping:
         linear = linear.clone()
         damper = {
-            letter: (np.diag(np.sqrt(damping) / kind.trust), np.zeros(kind.dim), gtsam.noiseModel.Unit.Create(kind.dim))
+            letter: (
+                np.diag(np.sqrt(damping) / kind.damping_scale),
+                np.zeros(kind.dim),
+                gtsam.noiseModel.Unit.Create(kind.dim),
+            )
             for letter, kind in STATES.items()
         }
         for i in range(order.size()):

@@ -10,10 +10,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.graph import STATES, Block, Measured, RowModel, SessionState, Step
-from smartnav_graph.losses import loss_weights, robust
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.graph.robust import loss_weights, robust
+from smartnav_graph.graph.states import STATES, SessionState
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate, Measured, RowModel
 
-Floats = NDArray[np.float64]
 Held = Mapping[int, Floats]
 
 
@@ -42,17 +43,17 @@ class Snapshot:
                 self._found[name] = value_of(self.values, letter, name)
         return np.array([self._found[name] for name in names])
 
-    def linearized(self, stack: Stack) -> tuple[Floats, list[Floats]]:
+    def linearized(self, stack: StackedFactors) -> tuple[Floats, list[Floats]]:
         """Residuals and Jacobians of a stack."""
         if id(stack) not in self._linear:
             self._linear[id(stack)] = stack.model.linearize(stack.states(self), stack.data)
         return self._linear[id(stack)]
 
 
-class Stack:
+class StackedFactors:
     """All rows of one model under one loss; `blocks` gives each row's origin."""
 
-    def __init__(self, model: RowModel, blocks: Sequence[Block], held: Held) -> None:
+    def __init__(self, model: RowModel, blocks: Sequence[FactorBatch], held: Held) -> None:
         self.model, self.blocks, self.held = model, blocks, held
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
@@ -130,19 +131,19 @@ def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -
     return gtsam.GaussianConditional(keys, 1, gtsam.VerticalBlockMatrix(dims, augmented))
 
 
-def stacks_of(blocks: Iterable[Block], held: Held) -> list[Stack]:
+def stacks_of(blocks: Iterable[FactorBatch], held: Held) -> list[StackedFactors]:
     """Blocks joined by sensor, model and loss."""
-    groups: dict[tuple[str, int, str], list[Block]] = {}
+    groups: dict[tuple[str, int, str], list[FactorBatch]] = {}
     for block in blocks:
         if block.keys:
             groups.setdefault((block.sensor, id(block.model), block.loss), []).append(block)
-    return [Stack(group[0].model, group, held) for group in groups.values()]
+    return [StackedFactors(group[0].model, group, held) for group in groups.values()]
 
 
 class WholeGraph:
     """What `minimise` needs of a graph: `linearize` and `error`."""
 
-    def __init__(self, factors: Iterable[Any], blocks: Iterable[Block], held: Held) -> None:
+    def __init__(self, factors: Iterable[Any], blocks: Iterable[FactorBatch], held: Held) -> None:
         self.native = gtsam.NonlinearFactorGraph()
         for factor in factors:
             self.native.push_back(factor)
@@ -151,16 +152,16 @@ class WholeGraph:
         self._last: Snapshot | None = None
 
     @classmethod
-    def of(cls, steps: Sequence[Step]) -> WholeGraph:
+    def of(cls, steps: Sequence[GraphUpdate]) -> WholeGraph:
         """Everything that steps add, with the priors of the session states they touch."""
         session: dict[int, SessionState] = {}
         held: dict[int, Floats] = {}
-        for step in steps:
-            session |= step.session
-            held |= step.held
+        for update in steps:
+            session |= update.session
+            held |= update.held
         priors = [session_prior(state) for state in session.values()]
-        factors = [factor for step in steps for _, factor in step.factors]
-        return cls(factors + priors, [block for step in steps for block in step.blocks], held)
+        factors = [factor for update in steps for _, factor in update.factors]
+        return cls(factors + priors, [block for update in steps for block in update.blocks], held)
 
     def linearize(self, values: Any) -> Any:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""
@@ -190,7 +191,7 @@ def session_prior(state: SessionState) -> Any:
 _SIZES: dict[RowModel, int] = {}
 
 
-def custom_factor(block: Block, row: int, held: Held) -> Any:
+def custom_factor(block: FactorBatch, row: int, held: Held) -> Any:
     """One row of a block as a gtsam.CustomFactor on the states that are not held."""
     model, keys, data = block.model, block.keys[row], block.data[row : row + 1]
     free = [i for i, k in enumerate(keys) if k not in held]

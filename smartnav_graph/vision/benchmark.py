@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.progress import Progress, silent, under
-from smartnav_graph.session import Session
-from smartnav_graph.streams import Matches, Reference
-from smartnav_graph.timebase import NS, interpolate, seconds_since
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.progress import Progress, silent, under
+from smartnav_graph.core.timebase import NS, interpolate, seconds_since
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Matches, Reference
 from smartnav_graph.vision.epipolar import rays, sampson
 from smartnav_graph.vision.front_end import FrontEndConfig, find
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 TOLERANCE_PX = 1.5
 DEPTH_M = 3.0

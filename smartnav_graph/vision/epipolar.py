@@ -18,9 +18,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
 
 
 class Sampson(NamedTuple):

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.vision.images import Gray
-
-Floats = NDArray[np.float64]
 
 # A detector is asked for so many times the points that are wanted.
 SURPLUS = 2

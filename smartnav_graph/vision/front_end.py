@@ -18,18 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.progress import Progress, silent
-from smartnav_graph.session import Session
-from smartnav_graph.streams import Matches, Tracks
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Matches, Tracks
 from smartnav_graph.vision import features, images, matching
 from smartnav_graph.vision.features import Features
 from smartnav_graph.vision.front_end_report import FrontEndReport
 from smartnav_graph.vision.images import Look, Picture
 from smartnav_graph.vision.matching import Pairing
-from smartnav_graph.vision.pool import ordered, threads
+from smartnav_graph.vision.parallel import ordered, threads
 from smartnav_graph.vision.tracking import Gyro, Tracker
 
 KLT = "klt"

@@ -19,11 +19,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.vision.epipolar import cross, rays
 from smartnav_graph.vision.pairs import Pairs
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Residual in sigmas up to which a match agrees, and hypotheses tried: with 30 % outliers half of them are sound.
 AGREES = 3.0

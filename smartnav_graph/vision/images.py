@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Session
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Session
 
 Gray = NDArray[np.uint8]
 

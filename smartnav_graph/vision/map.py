@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Mount, Session
-from smartnav_graph.streams import Images, PoseFix
-from smartnav_graph.timebase import NS, interpolate
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.session import Mount, Session
+from smartnav_graph.session.streams import Images, PoseFix
 from smartnav_graph.vision.similarity import Similarity, align
 
 if TYPE_CHECKING:
     import pycolmap
 
-Floats = NDArray[np.float64]
 
 SOURCE = "colmap"
 EXAMPLES = 3  # names that an error tells

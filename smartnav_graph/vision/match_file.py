@@ -19,15 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import SessionError
-from smartnav_graph.files import replacing
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import replacing
+from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.readers.text import first_lines, read_text
-from smartnav_graph.streams import Images, Matches
-from smartnav_graph.timebase import NS, nearest
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Images, Matches
 
 NAMES = ("time0", "time1", "x0", "y0", "x1", "y1")
 # Decimal places written: a nanometre, far below the noise of any match.

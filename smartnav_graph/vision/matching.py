@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 POLICIES = ("ratio", "thesis")

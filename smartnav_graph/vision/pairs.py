@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.streams import Matches, Tracks
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.streams import Matches, Tracks
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 # Images closer than this share of the spacing asked for count as far enough apart: stamps jitter.

@@ -6,13 +6,11 @@ Source: Hartley, Zisserman (2004), Multiple View Geometry, 9.6.2 (the four poses
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.vision.epipolar import cross, rays
 from smartnav_graph.vision.refine import Matched, angle
-
-Floats = NDArray[np.float64]
 
 CLEAR = 3.0  # sigmas of parallax from which on front and behind are certain
 ALIKE = 0.1  # of the matches: below that difference of votes two poses lie equally well in front

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.vision.consensus_pair import pixels_a_unit, usac
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.vision.epipolar import rays
+from smartnav_graph.vision.ransac import pixels_a_unit, usac
 from smartnav_graph.vision.refine import (
     GATE_SQUARE,
     REACH,
@@ -28,8 +29,6 @@ from smartnav_graph.vision.refine import (
     transfer,
 )
 from smartnav_graph.vision.uncertainty import UNKNOWNS, Other, inverse
-
-Floats = NDArray[np.float64]
 
 LEAST_PLANAR = 6  # matches: eight unknowns and four to judge them by
 LEAST_SHARE_OF_PLANE = 0.8  # of the coplanar matches: with fewer on it no plane explains more than depth does (GRIC)

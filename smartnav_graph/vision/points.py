@@ -17,11 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.streams import Tracks
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.session.streams import Tracks
 from smartnav_graph.vision.epipolar import cross, rays
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
 # Residual in sigmas up to which an observation agrees, pairs of rays tried, steps of the adjustment.

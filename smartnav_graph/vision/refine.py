@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.vision.epipolar import cross, rays, sampson
 
-Floats = NDArray[np.float64]
 State = tuple[Floats, ...]
 
 REACH = 3.0  # of the loss while inliers are still looked for, in sigmas

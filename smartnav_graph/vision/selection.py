@@ -20,9 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.vision.refine import GATE_SQUARE, Matched
-
-Floats = NDArray[np.float64]
 
 COORDINATES = 4
 UNKNOWNS = {"static": 0, "rotation": 3, "planar": 8, "general": 5}

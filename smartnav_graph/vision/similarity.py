@@ -12,11 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import SolverError
-
-Floats = NDArray[np.float64]
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SolverError
 
 LEAST = 4  # positions: seven unknowns, and something to judge them by
 LEAST_WIDTH = 0.01  # of the length: what is narrower is a line

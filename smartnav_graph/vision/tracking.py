@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.vision.epipolar import rays
 from smartnav_graph.vision.images import Gray
-
-Floats = NDArray[np.float64]
 
 WINDOW_PX = 21
 LEVELS = 3

@@ -19,12 +19,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.vision.consensus_pair import LEAST, OPTICAL_AXIS, Pose, colmap, directions, magsac, turns
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.vision.parallax import CLEAR, faced, in_front, parallax
 from smartnav_graph.vision.planar import CLEARLY_BETTER, PlanarFit, fit_plane
+from smartnav_graph.vision.ransac import LEAST, OPTICAL_AXIS, Pose, colmap, directions, magsac, turns
 from smartnav_graph.vision.refine import (
     GATE_SQUARE,
     REACH,
@@ -43,8 +43,6 @@ from smartnav_graph.vision.refine import (
 from smartnav_graph.vision.selection import Explained, by_chance, choose, hardly_moves, stands_still
 from smartnav_graph.vision.uncertainty import Other, covariance, shared, shares
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Kind = Literal["static", "rotation", "planar", "general", "failed"]
 
 METHODS: dict[str, Callable[[Matched, Floats, int], list[Pose]]] = {
@@ -89,7 +87,7 @@ class TwoView:
     c0_R_c1: Floats
     c0_t_c1: Floats
     covariance: Floats
-    inliers: Bools
+    inliers: Mask
     chi2_per_dof: float
     parallax_rad: float
 
@@ -277,7 +275,7 @@ def _refused(kind: Kind, matched: Matched, agree: int, fit: Fit | None, prior: R
 
 def _settled(
     model: Callable[[Matched], Model], matched: Matched, state: State, prior: RotationPrior | None
-) -> tuple[Bools, Fit | None]:
+) -> tuple[Mask, Fit | None]:
     """Inliers of a state and least squares on them, in turn until they stay."""
     checked = np.ones(len(matched.sigma), dtype=bool)
     inliers = _inliers(model, matched, state)
@@ -292,7 +290,7 @@ def _settled(
     return before, fit
 
 
-def _inliers(model: Callable[[Matched], Model], matched: Matched, state: State) -> Bools:
+def _inliers(model: Callable[[Matched], Model], matched: Matched, state: State) -> Mask:
     r, _ = model(matched).rows(state)
     good = np.asarray(np.einsum("mk,mk->m", r, r) < GATE_SQUARE[r.shape[1]])
     if model is Epipolar:
@@ -300,7 +298,7 @@ def _inliers(model: Callable[[Matched], Model], matched: Matched, state: State) 
     return good
 
 
-def _unchecked(fit: Fit) -> Bools:
+def _unchecked(fit: Fit) -> Mask:
     """Matches (m,) with so much say in the pose that the others cannot show them wrong (Baarda's redundancy numbers).
 
     A wrong match that happens to agree is such a one: it shows a point far nearer than all the others.

@@ -23,13 +23,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, State, rotation_vector, shifted, tangent_basis
-
-Floats = NDArray[np.float64]
 
 UNKNOWNS = 5
 LARGEST_CONDITION = 1e10  # of the scaled information: more is a direction the matches leave open

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.solution import Solution
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.session.streams import Reference
 
 T0 = 46_534_478_375_790
 

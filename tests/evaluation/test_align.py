@@ -9,12 +9,12 @@ import pytest
 from planted_run import T0, make_reference, make_solution
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, ns_from_seconds, ns_from_texts
 from smartnav_graph.evaluation import evaluate
 from smartnav_graph.evaluation.align import fit, track_of_solution
-from smartnav_graph.solution import Solution
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import NS, ns_from_seconds, ns_from_texts
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.session.streams import Reference
 
 
 def moved(solution, R, t, scale=1.0):

@@ -7,7 +7,7 @@ import pytest
 from planted_run import make_solution
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.evaluation.compare import MEASURES, compare, figure_differences, rejected_sets
 
 SECONDS = np.arange(0.0, 20.0, 0.5)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.explain import explain
-from smartnav_graph.explain.nearby import nearby
-from smartnav_graph.graph import key
-from smartnav_graph.influence import Group, Influence, Keyframes, Measurements
-from smartnav_graph.run_folder import plain, read_run, write_run
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.evaluation.influence import Group, Influence, Keyframes, Measurements
+from smartnav_graph.graph.states import key
+from smartnav_graph.output.explain import explain
+from smartnav_graph.output.explain.nearby import nearby
+from smartnav_graph.output.run_folder import plain, read_run, write_run
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ import pytest
 from lxml import etree
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import frames
-from smartnav_graph.errors import SessionError
-from smartnav_graph.export import FORMATS, export, write_trajectory_csv
-from smartnav_graph.export.geographic import GPX_NAMESPACE, MARKS, OWN_NAMESPACE
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.solution import Solution
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.output.export import FORMATS, export, write_trajectory_csv
+from smartnav_graph.output.export.geographic import GPX_NAMESPACE, MARKS, OWN_NAMESPACE
 
 ORIGIN = Origin(48.9825, 8.3904, 116.3)
 T0 = 1_748_772_000_123_456_789

@@ -15,16 +15,16 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import SessionError
-from smartnav_graph.export import export_pictures
-from smartnav_graph.export.exif import with_exif
-from smartnav_graph.export.pictures import TABLE
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.session import Mount, Session
-from smartnav_graph.solution import Solution
-from smartnav_graph.streams import Images
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.output.export import export_pictures
+from smartnav_graph.output.export.exif import with_exif
+from smartnav_graph.output.export.pictures import TABLE
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Mount, Session
+from smartnav_graph.session.streams import Images
 
 ORIGIN = Origin(-33.5, -70.25, 520.0)  # south and west: signs show
 T0 = 1_748_772_000_123_456_789  # 2025-06-01T10:00:00.123456789Z

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from smartnav_graph.factors.observation import Observation, exp
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.factors.observation import Observation
 
 
 def random_rotations(rng: np.random.Generator, m: int) -> np.ndarray:

@@ -11,18 +11,15 @@ from numeric import assert_observation, random_rotations
 from sessions import positions
 
 import smartnav_graph as sn
-from smartnav_graph.calibration.model import BarometerNoise
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors.barometer import (
-    BarometerBuilder,
-    BarometerConfig,
-    Height,
-    icao_height,
-    metres_a_hpa,
-)
-from smartnav_graph.graph import Memory, State, Step, Window, key
-from smartnav_graph.timebase import NS, ns_from_seconds
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.factors.barometer import BarometerBuilder, BarometerConfig, Height, icao_height, metres_a_hpa
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import BarometerNoise
 
 
 def test_the_standard_atmosphere():
@@ -69,13 +66,13 @@ def window(start: float, end: float, index: int = 1) -> Window:
     return Window(index, round(start * NS), round(end * NS), kind, np.zeros(0), empty, empty)
 
 
-def step_of(made: BarometerBuilder, at: Window, height: float = 0.0) -> Step:
+def step_of(made: BarometerBuilder, at: Window, height: float = 0.0) -> GraphUpdate:
     nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, height])), np.zeros(3))
     bias = gtsam.imuBias.ConstantBias()
-    step = Step(at.index, at.t1_ns, at.t1_ns / NS, predicted=nav, bias=bias)
+    update = GraphUpdate(at.index, at.t1_ns, at.t1_ns / NS, predicted=nav, bias=bias)
     previous = None if at.kind == "first" else State(at.index - 1, at.t0_ns, nav, bias)
-    made.add(step, at, previous, Memory())
-    return step
+    made.add(update, at, previous, PassState())
+    return update
 
 
 T_NS = ns_from_seconds(np.arange(0, 100) / 10)

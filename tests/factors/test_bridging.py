@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.factors.bridging import FLOOR, UNKNOWN, Bridge, bridged, bridges
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.factors.gap_model import FLOOR, UNKNOWN, Bridge, bridged, bridges
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.streams import Imu
 
 NOISE = DEVICE_CLASSES["mems"]
 GRAVITY = 9.81
@@ -54,7 +54,7 @@ def test_a_swing_is_carried_on_across_the_gap():
     found = bridges(line, gaps, NOISE)
     error, drawn = (
         np.sqrt(np.mean([(guess(gap) - mean(imu, gap)) ** 2 for gap in gaps], axis=0))
-        for guess in (lambda gap: found[gap.start_ns].told[0], lambda gap: mean(line, gap))
+        for guess in (lambda gap: found[gap.start_ns].expected[0], lambda gap: mean(line, gap))
     )
     assert (error < 0.1 * drawn).all(), (error, drawn)
 
@@ -64,7 +64,7 @@ def test_the_noise_is_what_unseen_gaps_turn_out_to_cost(noise):
     imu = swinging(600.0, noise)
     gaps = [hole(imu, i, 160) for i in range(1500, 58000, 1000)]
     found = bridges(straight(imu, gaps), gaps, NOISE)
-    error = np.array([found[gap.start_ns].told[0] - mean(imu, gap) for gap in gaps])
+    error = np.array([found[gap.start_ns].expected[0] - mean(imu, gap) for gap in gaps])
     cost = np.sqrt((error**2).mean(axis=0) * gaps[0].length_s)  # as a density
     whole = found[gaps[0].start_ns].over(gaps[0].length_s)
     told = np.concatenate([whole.accel, whole.gyro])
@@ -134,7 +134,7 @@ def test_a_bridge_is_never_surer_than_honest_data():
     found = bridges(imu, [gap], NOISE)[gap.start_ns]
     np.testing.assert_allclose(found.accel, FLOOR * NOISE.accel_noise_density)
     np.testing.assert_allclose(found.gyro, FLOOR * NOISE.gyro_noise_density)
-    np.testing.assert_allclose(found.told[0], [0, 0, GRAVITY, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(found.expected[0], [0, 0, GRAVITY, 0, 0, 0], atol=1e-6)
 
 
 def test_what_stands_inside_a_gap_teaches_nothing():
@@ -145,7 +145,7 @@ def test_what_stands_inside_a_gap_teaches_nothing():
         i, j = np.searchsorted(imu.t_ns, [g.start_ns, g.end_ns])
         wild[i + 1 : j] += 1000.0
     one, two = (bridges(x, [gap, other], NOISE)[gap.start_ns] for x in (imu, replace(imu, accel=wild)))
-    np.testing.assert_allclose(two.told[0], one.told[0], rtol=1e-9)
+    np.testing.assert_allclose(two.expected[0], one.expected[0], rtol=1e-9)
     np.testing.assert_allclose(two.accel, one.accel, rtol=1e-9)
 
 
@@ -153,13 +153,13 @@ def test_a_gap_longer_than_the_rest_learns_from_shorter_stretches():
     imu = swinging(40.0, 0.5)
     gap = hole(imu, 1000, 2500)
     found = bridges(imu, [gap], NOISE)[gap.start_ns]
-    assert found.told is not None and found.accel.max() < UNKNOWN * NOISE.accel_noise_density
+    assert found.expected is not None and found.accel.max() < UNKNOWN * NOISE.accel_noise_density
 
 
 def test_two_samples_only():
     bare = Imu(t_ns=[0, 2 * NS], accel=np.zeros((2, 3)), gyro=np.zeros((2, 3)))
     found = bridges(bare, [Gap(0, 2 * NS, "missing")], NOISE)[0]
-    assert found.told is None
+    assert found.expected is None
     assert (found.accel == UNKNOWN * NOISE.accel_noise_density).all()
     assert (found.gyro == UNKNOWN * NOISE.gyro_noise_density).all()
 
@@ -169,7 +169,7 @@ def test_a_gap_at_the_very_start_is_seen_from_its_end():
     late = imu.take((imu.t_ns == 0) | (imu.t_ns >= 2 * NS))
     gap = Gap(0, 2 * NS, "missing")
     found = bridges(late, [gap], NOISE)[0]
-    assert np.abs(found.told[0] - mean(imu, gap))[:3].max() < 4 * found.accel.max() / np.sqrt(gap.length_s)
+    assert np.abs(found.expected[0] - mean(imu, gap))[:3].max() < 4 * found.accel.max() / np.sqrt(gap.length_s)
 
 
 @pytest.mark.parametrize("kind", ["missing", "bridged"])
@@ -181,7 +181,7 @@ def test_the_curve_has_the_mean_and_leaves_the_rest_alone(kind):
     filled = bridged(faulty, [gap], bridges(faulty, [gap], NOISE))
     np.testing.assert_array_equal(filled.t_ns, imu.t_ns)
     np.testing.assert_allclose(filled.accel[~inside], imu.accel[~inside], atol=1e-9)
-    np.testing.assert_allclose(mean(filled, gap), bridges(faulty, [gap], NOISE)[gap.start_ns].told[0], atol=1e-4)
+    np.testing.assert_allclose(mean(filled, gap), bridges(faulty, [gap], NOISE)[gap.start_ns].expected[0], atol=1e-4)
 
 
 def test_without_gaps_nothing_changes():

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.factors.camera import BodyRates, Eye, Motion, seen_from
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.factors.camera import BodyRates, CameraModel, Motion, seen_from
 from smartnav_graph.factors.coplanar_rows import Rig
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Imu
 
 T0 = 1_700_000_000 * NS
 BODY_R_CAM = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 RIG = Rig(BODY_R_CAM, np.array([0.0, 0.3, 0.0]), boresight=True, timed=True)
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, distortion=(0.1, 0.0, 0.0, 0.0))
-EYE = Eye(CAMERA, RIG, 0.03, 0.01, 0.02)
+EYE = CameraModel(CAMERA, RIG, 0.03, 0.01, 0.02)
 
 
 @pytest.fixture
@@ -50,8 +50,8 @@ def test_rays_are_turned_back_to_the_first_row(rng):
     world = rng.uniform([-3, -3, 8], [3, 3, 12], (20, 3))
     rate = np.array([0.4, -0.7, 1.1])  # rad/s, body axes
     delay = rng.uniform(0.0, 0.03, 20)
-    turned = Rotation.from_rotvec(delay[:, None] * (BODY_R_CAM.T @ rate))
-    later = turned.inv().apply(world)
+    rotate = Rotation.from_rotvec(delay[:, None] * (BODY_R_CAM.T @ rate))
+    later = rotate.inv().apply(world)
     at = np.full(20, T0 + NS)
     bias = np.full((20, 3), 0.02)
     turns = EYE.turns(rates(lambda s: rate + 0.02), at, delay, bias)
@@ -70,5 +70,5 @@ def test_the_camera_moves_with_its_lever_arm():
     ("boresight", "timed", "letters"), [(True, True, "TA"), (False, True, "T"), (False, False, "")]
 )
 def test_only_states_that_are_asked_for(boresight, timed, letters):
-    eye = Eye(CAMERA, Rig(BODY_R_CAM, np.zeros(3), boresight, timed), 0.0, 0.01, 0.02)
-    assert "".join(eye.states()) == letters
+    camera_model = CameraModel(CAMERA, Rig(BODY_R_CAM, np.zeros(3), boresight, timed), 0.0, 0.01, 0.02)
+    assert "".join(camera_model.states()) == letters

@@ -16,14 +16,16 @@ from exact import GRAVITY, LEVER, Graph, Recording, assemble, assert_derivative,
 from scipy.stats import chi2
 from test_contract_rows import CASES
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors import BUILDERS
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph import Memory, State, Step, key
-from smartnav_graph.session import Mount, Session
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.timebase import NS
 
 # Largest |component| of the honest residual, and sensors (tags) the builder speaks for.
 #   imu: rad, m, m/s after 1 s (second order integration of 100 Hz samples); positions: rounding.
@@ -222,10 +224,10 @@ def test_the_derivatives_of_the_prior_at_its_mean(graph, sigma_pos):
     prior = PriorBuilder(
         start, np.array([0.1, 0.2, 0.3]), sigma_pos, np.full(3, 0.5), np.full(6, 0.1), np.array([1.0, 2.0, 3.0]), bias
     )
-    step = Step(0, 0, 0.0)
-    prior.add(step, graph.windows[0], None, Memory())
-    assert len(step.factors) == 3
-    for _, factor in step.factors:
+    update = GraphUpdate(0, 0, 0.0)
+    prior.add(update, graph.windows[0], None, PassState())
+    assert len(update.factors) == 3
+    for _, factor in update.factors:
         assert_derivative(factor, values)
 
 
@@ -250,8 +252,8 @@ def test_whitened_residuals_of_simulated_noise_have_unit_variance(tag):
 @pytest.mark.parametrize(("tag", "group"), [("imu", "gyro"), ("imu_bias", "gyro_walk")])
 def test_that_bound_sees_a_noise_wrong_by_forty_per_cent(tag, group, wrong):
     noisy = record(noise=DEVICE_CLASSES["mems"], seed=0)
-    memory = Memory(noise_scales={group: wrong, group.replace("gyro", "accel"): wrong})
-    graph = assemble(noisy.session, noisy.truth, bias=noisy.bias, memory=memory)
+    pass_state = PassState(noise_scales={group: wrong, group.replace("gyro", "accel"): wrong})
+    graph = assemble(noisy.session, noisy.truth, bias=noisy.bias, pass_state=pass_state)
     white = np.array([factor.whitenedError(graph.values) for _, factor in graph.factors(tag)])
     low, high = chi2(4 * white.size).ppf([1e-4, 1 - 1e-4]) / (4 * white.size)
     assert not low < (white**2).mean() < high

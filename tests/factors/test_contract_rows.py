@@ -17,19 +17,20 @@ from exact import LEVER, START_NS, Graph, Recording, assemble, assert_derivative
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from smartnav_graph.calibration.model import BarometerNoise, Calibration, MagnetometerNoise
-from smartnav_graph.errors import SessionError
-from smartnav_graph.graph import LAST_STAGE, Memory, kind_of
-from smartnav_graph.session import Device, Session
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.states import kind_of
+from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, MagnetometerNoise
+from smartnav_graph.session.session import Device, Session
+from smartnav_graph.session.streams import Magnetometer, PoseFix, Velocity, WheelSpeed
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
-from smartnav_graph.streams import Magnetometer, PoseFix, Velocity, WheelSpeed
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 Wrong = Callable[[Session], Session]
 Record = Callable[[int | None], Recording]
 SHIFT_NS = NS // 10
-MEMORY = Memory(stage=LAST_STAGE)
+MEMORY = PassState(stage=LAST_STAGE)
 
 
 @dataclass(frozen=True)
@@ -318,7 +319,7 @@ MISTAKES = [(sensor, name) for sensor, case in CASES.items() for name in case.mu
 def graph_of(sensor: str, seed: int | None = None) -> Graph:
     case = CASES[sensor]
     made = case.record(seed)
-    return assemble(made.session, made.truth, bias=made.bias, memory=MEMORY, known=case.known)
+    return assemble(made.session, made.truth, bias=made.bias, pass_state=MEMORY, known=case.known)
 
 
 def white(graph: Graph, sensor: str) -> np.ndarray:
@@ -342,7 +343,7 @@ def test_a_mistake_shows_in_the_residual(sensor, name):
     case = CASES[sensor]
     wrong, floor = case.mutations[name]
     made = case.record(None)
-    found = rms(white(assemble(wrong(made.session), made.truth, memory=MEMORY, known=case.known), sensor))
+    found = rms(white(assemble(wrong(made.session), made.truth, pass_state=MEMORY, known=case.known), sensor))
     assert found > floor > 2 * case.honest, found
 
 
@@ -379,7 +380,7 @@ def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor):
         **{name: stream.take(stream.t_ns <= cut) for name, stream in made.session.streams().items()}
     )
     full = graph_of(sensor)
-    part = assemble(shorter, made.truth, memory=MEMORY, known=case.known)
+    part = assemble(shorter, made.truth, pass_state=MEMORY, known=case.known)
     # without fixes keyframes stand at full seconds; else later windows end where the recording does
     last = max((w.t1_ns for w in part.windows if w.rows), default=cut)
     known = min(last, cut - ns_from_seconds(case.lookahead_s))

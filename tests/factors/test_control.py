@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from exact import LEVER, assemble, record
 
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import BUILDERS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.control import ControlConfig
-from smartnav_graph.graph import Memory
-from smartnav_graph.session import Mount
-from smartnav_graph.streams import ControlPoint
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Mount
+from smartnav_graph.session.streams import ControlPoint
 
 
 def made(session, **config):
@@ -60,7 +60,7 @@ def test_the_sigma_of_surveyed_points_is_never_estimated():
 
 def test_control_and_fixes_are_rejected_apart():
     recording = record()
-    both = assemble(recording.session, recording.truth, memory=Memory(rejected={"control": frozenset({0})}))
+    both = assemble(recording.session, recording.truth, pass_state=PassState(rejected={"control": frozenset({0})}))
     assert [tag.row for tag, _ in both.factors("control")] == list(range(1, len(recording.session.control)))
     assert len(both.factors("gnss")) == len(recording.session.gnss)
 

@@ -8,22 +8,25 @@ import pytest
 from exact import LEVER, assemble, assert_derivative, record
 from scipy.stats import chi2
 
-from smartnav_graph.calibration.model import GnssNoise
-from smartnav_graph.factors.correlated import add_wander
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.factors.gauss_markov import add_wander
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder
-from smartnav_graph.graph import Memory, State, Step, Window, key
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.simulation.fixes import gauss_markov
 from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 NOISE = GnssNoise(correlated_horizontal_sigma=4.0, correlated_vertical_sigma=6.0, correlated_time=60.0)
-WANDERING = Memory(correlated=frozenset({"gnss"}))
+WANDERING = PassState(correlated=frozenset({"gnss"}))
 
 
 @pytest.fixture(scope="module")
 def graph():
     recording = record()
-    made = assemble(recording.session, recording.truth, memory=WANDERING)
+    made = assemble(recording.session, recording.truth, pass_state=WANDERING)
     rng = np.random.default_rng(0)
     for window in made.windows:
         made.values.update(key("C", window.index), rng.uniform(-5, 5, 3))
@@ -87,10 +90,10 @@ def chain(seconds: np.ndarray) -> gtsam.NonlinearFactorGraph:
     graph, empty = gtsam.NonlinearFactorGraph(), np.zeros((0, 3))
     t_ns = ns_from_seconds(seconds)
     for k, t in enumerate(t_ns):
-        step = Step(k, int(t), t / NS)
+        update = GraphUpdate(k, int(t), t / NS)
         window = Window(k, int(t_ns[max(k - 1, 0)]), int(t), "normal", np.zeros(0), empty, empty)
-        add_wander(step, window, State(k - 1, 0, None, None) if k else None, NOISE)
-        for _, factor in step.factors:
+        add_wander(update, window, State(k - 1, 0, None, None) if k else None, NOISE)
+        for _, factor in update.factors:
             graph.push_back(factor)
     return graph
 
@@ -140,4 +143,4 @@ def test_fixes_of_metres_wander(sigma, noise, config, expected):
     fixes = PositionBuilder(
         "gnss", np.zeros((n, 3)), np.full((n, 3), sigma), np.ones(n, dtype=bool), np.zeros(3), config, noise
     )
-    assert fixes.wanders(Memory()) == expected
+    assert fixes.wanders(PassState()) == expected

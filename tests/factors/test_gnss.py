@@ -10,13 +10,16 @@ import pytest
 from exact import LEVER, assemble, record
 from scipy.stats import chi2
 
-from smartnav_graph.calibration.model import GnssNoise
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, fix_sigmas, noise_model
-from smartnav_graph.frames import LocalFrame, Origin
-from smartnav_graph.graph import Memory, Step, Window, key
-from smartnav_graph.streams import GnssFix
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.streams import GnssFix
 
 
 def builder(
@@ -33,10 +36,12 @@ def window(*rows: int) -> Window:
     return Window(7, NS, NS, "normal", np.zeros(0), empty, empty, {"gnss": np.array(rows)})
 
 
-def added(fixes: PositionBuilder, memory: Memory | None = None, step: Step | None = None, rows=(0,)) -> Step:
-    step = step or Step(7, NS, 1.0)
-    fixes.add(step, window(*rows), None, memory or Memory())
-    return step
+def added(
+    fixes: PositionBuilder, pass_state: PassState | None = None, update: GraphUpdate | None = None, rows=(0,)
+) -> GraphUpdate:
+    update = update or GraphUpdate(7, NS, 1.0)
+    fixes.add(update, window(*rows), None, pass_state or PassState())
+    return update
 
 
 def at(x: float, y: float, z: float, yaw_deg: float = 0.0) -> gtsam.Values:
@@ -81,16 +86,16 @@ def test_sigmas_are_the_rows_own_where_known_and_the_default_elsewhere():
 
 
 def test_a_noise_scale_leaves_sigmas_that_came_with_the_data_alone():
-    memory = Memory(noise_scales={"gnss": 5.0})
+    pass_state = PassState(noise_scales={"gnss": 5.0})
     for own, expected in ((True, [1, 2, 3]), (False, [5, 10, 15])):
-        ((_, factor),) = added(builder(own=own), memory).factors
+        ((_, factor),) = added(builder(own=own), pass_state).factors
         np.testing.assert_allclose(factor.noiseModel().sigmas(), expected)
-        np.testing.assert_allclose(builder(own=own).scaled_sigma(memory), [expected])
+        np.testing.assert_allclose(builder(own=own).scaled_sigma(pass_state), [expected])
 
 
 def test_rejected_rows_get_no_factor_and_several_rows_share_a_keyframe():
     fixes = builder(position=np.zeros((3, 3)), sigma=np.ones((3, 3)))
-    step = added(fixes, Memory(rejected={"gnss": frozenset({1}), "control": frozenset({0})}), rows=(0, 1, 2))
+    step = added(fixes, PassState(rejected={"gnss": frozenset({1}), "control": frozenset({0})}), rows=(0, 1, 2))
     assert [tag.row for tag, _ in step.factors] == [0, 2]
 
 
@@ -113,7 +118,7 @@ def test_a_loss_acts_on_the_whole_fix(loss, weighted):
     [("gate", "plain", False), ("gate", "robust", True), ("gate", "gated", False), ("huber", "plain", True)],
 )
 def test_the_loss_follows_the_phase(loss, phase, robust):
-    ((_, factor),) = added(builder(loss=loss), Memory(phase=phase)).factors
+    ((_, factor),) = added(builder(loss=loss), PassState(phase=phase)).factors
     assert isinstance(factor.noiseModel(), gtsam.noiseModel.Robust) == robust
 
 
@@ -123,22 +128,22 @@ def test_the_loss_follows_the_phase(loss, phase, robust):
     [(20.0, False), (24.0, False), (24.5, True), (200.0, True)],
 )
 def test_replay_doubts_a_fix_that_contradicts_the_prediction(off_m, robust):
-    step = Step(7, NS, 1.0, predicted=gtsam.NavState(), variance=np.full(3, 3.0))
+    update = GraphUpdate(7, NS, 1.0, predicted=gtsam.NavState(), variance=np.full(3, 3.0))
     fixes = builder(position=[[off_m, 0.0, 0.0]], sigma=[[1.0, 1.0, 1.0]])
-    ((_, factor),) = added(fixes, Memory(phase="causal"), step).factors
+    ((_, factor),) = added(fixes, PassState(phase="causal"), update).factors
     assert isinstance(factor.noiseModel(), gtsam.noiseModel.Robust) == robust
 
 
 def test_replay_takes_a_fix_at_its_word_where_nothing_is_foretold():
-    ((_, factor),) = added(builder(position=[[1e6, 0, 0]]), Memory(phase="causal")).factors
+    ((_, factor),) = added(builder(position=[[1e6, 0, 0]]), PassState(phase="causal")).factors
     assert not isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 
 def test_the_lever_arm_is_part_of_what_is_foretold():
-    turned = gtsam.NavState(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3), np.zeros(3))
+    rotate = gtsam.NavState(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3), np.zeros(3))
     fixes = builder(position=[[0.0, 40.0, 0.0]], sigma=[[1.0, 1.0, 1.0]], lever=(40.0, 0.0, 0.0))
-    step = Step(7, NS, 1.0, predicted=turned, variance=np.full(3, 3.0))
-    ((_, factor),) = added(fixes, Memory(phase="causal"), step).factors
+    update = GraphUpdate(7, NS, 1.0, predicted=rotate, variance=np.full(3, 3.0))
+    ((_, factor),) = added(fixes, PassState(phase="causal"), update).factors
     assert not isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 

@@ -10,16 +10,19 @@ import pytest
 from exact import GRAVITY, START_NS, record
 from numeric import assert_observation, random_rotations
 
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import FactorContext, gravity
 from smartnav_graph.factors.gravity import GravityBuilder, GravityConfig, Stretch, Upright
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.graph import Memory, State, Step, Window
-from smartnav_graph.session import Device
-from smartnav_graph.standstill import Standstills
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.detect.standstills import Standstills
+from smartnav_graph.session.session import Device
 
 REST = np.array([0.0, 0.0, GRAVITY])
 
@@ -61,17 +64,17 @@ def windows(seconds: int, force=REST, rate=(0.0, 0.0, 0.0), hertz: int = 50, beg
     return made
 
 
-def steps_of(builder: GravityBuilder, stretch: list[Window]) -> list[Step]:
+def steps_of(builder: GravityBuilder, stretch: list[Window]) -> list[GraphUpdate]:
     nav, bias = gtsam.NavState(), gtsam.imuBias.ConstantBias()
     steps = []
     for window in stretch:
-        step = Step(window.index, window.t1_ns, window.t1_ns / NS, predicted=nav, bias=bias)
-        builder.add(step, window, State(window.index, window.t0_ns, nav, bias), Memory())
-        steps.append(step)
+        update = GraphUpdate(window.index, window.t1_ns, window.t1_ns / NS, predicted=nav, bias=bias)
+        builder.add(update, window, State(window.index, window.t0_ns, nav, bias), PassState())
+        steps.append(update)
     return steps
 
 
-def rows_of(steps: list[Step]) -> list[int]:
+def rows_of(steps: list[GraphUpdate]) -> list[int]:
     return [step.index for step in steps if step.blocks]
 
 

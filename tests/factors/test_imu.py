@@ -11,14 +11,17 @@ from exact import GRAVITY, assemble, record
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES, ImuNoise
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors.bridging import Bridge
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.factors.imu import ImuBuilder, ImuConfig
-from smartnav_graph.graph import Memory, State, Step, Window
-from smartnav_graph.keyframes import KeyframeConfig, make_windows
-from smartnav_graph.streams import Imu
-from smartnav_graph.timebase import NS, Gap, ns_from_seconds
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
+from smartnav_graph.session.streams import Imu
 
 NOISE = DEVICE_CLASSES["mems"]
 ZERO = gtsam.imuBias.ConstantBias()
@@ -45,7 +48,7 @@ def builder(noise: ImuNoise = NOISE, **kwargs) -> ImuBuilder:
 
 def predicted(window: Window, v=(0.0, 0.0, 0.0), bias=ZERO) -> gtsam.NavState:
     start = gtsam.NavState(gtsam.Rot3(), np.zeros(3), np.array(v))
-    return builder().preintegrate(window, bias, Memory()).predict(start, bias)
+    return builder().preintegrate(window, bias, PassState()).predict(start, bias)
 
 
 def test_a_device_at_rest_stays():
@@ -100,7 +103,7 @@ def combined(window: Window, noise: ImuNoise, integration_sigma: float) -> gtsam
 
 def test_imu_factor_and_walk_agree_with_combined_imu_factor_over_a_second():
     window = turning()
-    ours, theirs = builder().preintegrate(window, ZERO, Memory()), combined(window, NOISE, 1e-3)
+    ours, theirs = builder().preintegrate(window, ZERO, PassState()), combined(window, NOISE, 1e-3)
     start = gtsam.NavState(gtsam.Rot3.Ypr(0.3, 0.1, -0.2), np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
     one, other = ours.predict(start, ZERO), theirs.predict(start, ZERO)
     np.testing.assert_allclose(one.position(), other.position(), atol=1e-9)
@@ -131,10 +134,10 @@ def test_the_covariance_is_that_of_gtsams_scenario_runner():
     config = ImuConfig(integration_sigma=1e-7)
     ours = builder(noise, config=config)
     scenario = gtsam.ConstantTwistScenario(np.array([0.1, -0.2, 0.6]), np.array([0.0, 5.0, 0.3]))
-    runner = gtsam.ScenarioRunner(scenario, ours.params(Memory()), 0.01, ZERO)
+    runner = gtsam.ScenarioRunner(scenario, ours.params(PassState()), 0.01, ZERO)
     t = np.arange(100) * 0.01
     window = window_of([runner.actualSpecificForce(x) for x in t], [runner.actualAngularVelocity(x) for x in t])
-    mine = ours.preintegrate(window, ZERO, Memory()).preintMeasCov()
+    mine = ours.preintegrate(window, ZERO, PassState()).preintMeasCov()
     oracle = runner.estimateCovariance(1.0, 2000, ZERO)
     # a variance of 2000 samples, 4 sigma: 4 sqrt(2 / 2000) = 13 %
     np.testing.assert_allclose(np.diag(mine), np.diag(oracle), rtol=0.13)
@@ -153,7 +156,7 @@ def test_the_covariance_is_that_of_a_monte_carlo_of_the_mechanisation():
         a = R.apply(force + accel_sigma * rng.standard_normal((runs, 3)))
         p, v = p + v * dt + 0.5 * a * dt**2, v + a * dt
         R = R * Rotation.from_rotvec((rate + gyro_sigma * rng.standard_normal((runs, 3))) * dt)
-    mine = builder(config=ImuConfig(integration_sigma=1e-7)).preintegrate(window, ZERO, Memory()).preintMeasCov()
+    mine = builder(config=ImuConfig(integration_sigma=1e-7)).preintegrate(window, ZERO, PassState()).preintMeasCov()
     end = Rotation.from_rotvec(window.gyro.mean(axis=0) * 1.0)
     spread = np.hstack([(end.inv() * R).as_rotvec(), p - p.mean(axis=0), v - v.mean(axis=0)])
     low, high = chi2(runs - 1).ppf([1e-5, 1 - 1e-5]) / (runs - 1)
@@ -164,21 +167,21 @@ def test_the_covariance_is_that_of_a_monte_carlo_of_the_mechanisation():
 
 
 def test_noise_scales_act_on_their_own_group():
-    scaled = builder().params(Memory(noise_scales={"accel": 2.0, "gyro": 3.0}))
+    scaled = builder().params(PassState(noise_scales={"accel": 2.0, "gyro": 3.0}))
     np.testing.assert_allclose(scaled.getAccelerometerCovariance(), np.eye(3) * (2 * NOISE.accel_noise_density) ** 2)
     np.testing.assert_allclose(scaled.getGyroscopeCovariance(), np.eye(3) * (3 * NOISE.gyro_noise_density) ** 2)
 
 
 def test_no_default_of_gtsam_is_left():
-    params = builder().params(Memory())
+    params = builder().params(PassState())
     for covariance in ("getAccelerometerCovariance", "getGyroscopeCovariance", "getIntegrationCovariance"):
         assert np.diag(getattr(params, covariance)()).max() < 1e-2  # GTSAM's own are one
 
 
 def test_scaled_noise_is_not_kept_for_the_next_pass():
     ours = builder()
-    plain = ours.preintegrate(turning(), ZERO, Memory()).preintMeasCov()
-    louder = ours.preintegrate(turning(), ZERO, Memory(noise_scales={"gyro": 2.0})).preintMeasCov()
+    plain = ours.preintegrate(turning(), ZERO, PassState()).preintMeasCov()
+    louder = ours.preintegrate(turning(), ZERO, PassState(noise_scales={"gyro": 2.0})).preintMeasCov()
     np.testing.assert_allclose(louder[:3, :3], 4 * plain[:3, :3], rtol=1e-6)
 
 
@@ -186,22 +189,22 @@ def test_scaled_noise_is_not_kept_for_the_next_pass():
 
 
 def test_the_first_keyframe_gets_no_inertial_factor():
-    step = Step(0, 0, 0.0)
-    builder().add(step, replace(turning(), index=0, kind="first"), None, Memory())
-    assert step.factors == [] and step.predicted is None
+    update = GraphUpdate(0, 0, 0.0)
+    builder().add(update, replace(turning(), index=0, kind="first"), None, PassState())
+    assert update.factors == [] and update.predicted is None
 
 
 def test_the_step_foretells_the_state_and_its_variance():
     covariance = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 4.0), np.full(3, 0.25), np.full(6, 1e-6)])
     nav = gtsam.NavState(gtsam.Rot3(), np.array([1.0, 2.0, 3.0]), np.array([4.0, 0.0, 0.0]))
-    step = Step(1, NS, 1.0)
+    update = GraphUpdate(1, NS, 1.0)
     window = window_of(np.tile([0, 0, GRAVITY], (100, 1)), np.zeros((100, 3)))
-    builder().add(step, window, State(0, 0, nav, ZERO, covariance), Memory())
-    np.testing.assert_allclose(step.predicted.position(), [5.0, 2.0, 3.0], atol=1e-12)
-    np.testing.assert_allclose(step.foretell(nav, ZERO).position(), [5.0, 2.0, 3.0], atol=1e-12)
+    builder().add(update, window, State(0, 0, nav, ZERO, covariance), PassState())
+    np.testing.assert_allclose(update.predicted.position(), [5.0, 2.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(update.predict(nav, ZERO).position(), [5.0, 2.0, 3.0], atol=1e-12)
     # position 4 m^2, velocity 0.25 m^2/s^2 over 1 s, tilt (g/2 * 0.01)^2, white force density^2 / 3, integration 1e-6
     expected = 4.0 + 0.25 + (GRAVITY / 2) ** 2 * 1e-4 + NOISE.accel_noise_density**2 / 3 + 1e-6
-    np.testing.assert_allclose(step.variance, expected, rtol=1e-4)
+    np.testing.assert_allclose(update.variance, expected, rtol=1e-4)
 
 
 # --- gaps -------------------------------------------------------------------------------------------------------------
@@ -215,12 +218,12 @@ def test_a_window_in_a_gap_takes_the_bridge_noise():
     ours = ImuBuilder(NOISE, GRAVITY, [gap], {gap.start_ns: bridge})
     windows = make_windows(imu, np.array([3, 4, 5, 6]) * NS, [gap], {}, KeyframeConfig())
     assert [w.kind for w in windows] == ["first", "normal", "gap", "normal"]
-    normal, inside = (ours.preintegrate(w, ZERO, Memory()).preintMeasCov() for w in windows[1:3])
+    normal, inside = (ours.preintegrate(w, ZERO, PassState()).preintMeasCov() for w in windows[1:3])
     np.testing.assert_allclose(np.sqrt(np.diag(inside)[6:]), bridge.accel, rtol=0.02)
     np.testing.assert_allclose(np.sqrt(np.diag(inside)[:3]), bridge.gyro, rtol=1e-3)
     assert np.sqrt(np.diag(normal)[6:]).max() < 0.1
     half = ImuBuilder(NOISE, GRAVITY, [gap], {gap.start_ns: bridge}, ImuConfig(gap_factor=2.0))
-    twice = half.preintegrate(windows[2], ZERO, Memory()).preintMeasCov()
+    twice = half.preintegrate(windows[2], ZERO, PassState()).preintMeasCov()
     np.testing.assert_allclose(np.sqrt(np.diag(twice)[:3]), 2 * bridge.gyro, rtol=1e-3)
 
 
@@ -236,11 +239,11 @@ def test_a_turn_raises_the_noise_of_an_uncalibrated_gyro_in_replay():
     window = Window(1, 0, NS // 2, "normal", dt, np.zeros((50, 3)), gyro)
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.2]))
     builder = ImuBuilder(DEVICE_CLASSES["mems"], 9.81)
-    causal = Memory(phase="causal")
+    causal = PassState(phase="causal")
     found = builder.turning(window, bias, causal).scale("gyro") * DEVICE_CLASSES["mems"].gyro_noise_density
     own = DEVICE_CLASSES["mems"].gyro_noise_density
     assert found**2 * 0.5 == pytest.approx(own**2 * 0.5 + (0.005 * 0.3) ** 2)
-    assert builder.turning(window, bias, Memory()).scale("gyro") == 1.0  # batch finds its noise
+    assert builder.turning(window, bias, PassState()).scale("gyro") == 1.0  # batch finds its noise
     calibrated = ImuBuilder(DEVICE_CLASSES["mems"], 9.81, weight=20.0)
     assert calibrated.turning(window, bias, causal).scale("gyro") == 1.0
     back = Window(

@@ -10,9 +10,10 @@ import pytest
 from numeric import assert_observation, random_rotations
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import MagnetometerNoise
-from smartnav_graph.errors import CalibrationError, ConfigError
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import CalibrationError, ConfigError
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.magnetometer import (
     MODEL,
     REACH,
@@ -22,9 +23,11 @@ from smartnav_graph.factors.magnetometer import (
     turned_mean,
     unearthly,
 )
-from smartnav_graph.factors.observation import exp
-from smartnav_graph.graph import Memory, State, Step, Window
-from smartnav_graph.timebase import NS, ns_from_seconds
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import MagnetometerNoise
 
 STRENGTH = np.array([19.0, -45.0])  # uT, horizontal and up: middle Europe
 DECLINATION = np.radians(4.6)
@@ -130,11 +133,11 @@ def builder(**changes) -> MagnetometerBuilder:
     return MagnetometerBuilder(**{**values, **changes})
 
 
-def step_of(made: MagnetometerBuilder, window: Window, memory: Memory | None = None) -> Step:
+def step_of(made: MagnetometerBuilder, window: Window, pass_state: PassState | None = None) -> GraphUpdate:
     nav, bias = gtsam.NavState(), gtsam.imuBias.ConstantBias()
-    step = Step(window.index, window.t1_ns, window.t1_ns / NS, predicted=nav, bias=bias)
-    made.add(step, window, State(window.index - 1, window.t0_ns, nav, bias), memory or Memory(stage=1))
-    return step
+    update = GraphUpdate(window.index, window.t1_ns, window.t1_ns / NS, predicted=nav, bias=bias)
+    made.add(update, window, State(window.index - 1, window.t0_ns, nav, bias), pass_state or PassState(stage=1))
+    return update
 
 
 def test_one_row_a_window_on_pose_iron_and_field():
@@ -188,14 +191,14 @@ def test_intensity_and_dip_tell_a_disturbance(field_ut, used):
 @pytest.mark.parametrize(("sigma", "used"), [(1.0, True), (15.0, False)])
 def test_a_held_hard_iron_is_used_only_where_it_was_calibrated(sigma, used):
     made = builder(iron_sigma=sigma)
-    memory = Memory(stage=1, held={"magnetometer_hard_iron_ut": np.zeros(3)})
-    (block,) = step_of(made, turning((0.0, 0.0, 0.0)), memory).blocks
+    pass_state = PassState(stage=1, held={"magnetometer_hard_iron_ut": np.zeros(3)})
+    (block,) = step_of(made, turning((0.0, 0.0, 0.0)), pass_state).blocks
     assert block.used == (used,)
 
 
 def test_first_seconds_make_a_held_hard_iron_usable_and_leave_its_prior_as_wide_as_it_was():
     made = builder(iron_sigma=240.0, held_in_replay=True, reading=np.tile(NAV_FIELD + IRON, (100, 1)))
-    causal = Memory(stage=1, phase="causal")
+    causal = PassState(stage=1, phase="causal")
     assert step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks[0].used == (False,)
     made.begin(IRON, 2.0)
     (block,) = step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks

@@ -10,21 +10,13 @@ import pytest
 from exact import GRAVITY, angle_deg, kinematics, record
 from numeric import assert_jacobians
 
-from smartnav_graph.factors.observation import (
-    WIDTH,
-    AtInstant,
-    AtKeyframe,
-    Partial,
-    exp,
-    here,
-    preintegrated,
-    skew,
-    turned,
-)
-from smartnav_graph.graph import STATES, Window
-from smartnav_graph.keyframes import KeyframeConfig, make_windows
-from smartnav_graph.prediction import states_at
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.so3 import exp, rotate, skew
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.factors.observation import WIDTH, AtInstant, AtKeyframe, PartialPreintegration, here, preintegrated
+from smartnav_graph.graph.interpolate import states_at
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.graph.states import STATES
+from smartnav_graph.graph.windows import Window
 
 NO_BIAS = gtsam.imuBias.ConstantBias()
 
@@ -40,12 +32,12 @@ class Probe:
         (lever,) = extra
         arrow, weight = data[:, 1:4], data[:, :1, None]
         back = R.transpose(0, 2, 1)
-        residual = np.concatenate([turned(R, arrow), p + turned(R, lever), turned(back, v)], axis=1) * weight[:, :, 0]
+        residual = np.concatenate([rotate(R, arrow), p + rotate(R, lever), rotate(back, v)], axis=1) * weight[:, :, 0]
         by_state = np.zeros((len(R), 9, 9))
         by_state[:, :3, :3] = -R @ skew(arrow)
         by_state[:, 3:6, :3] = -R @ skew(lever)
         by_state[:, 3:6, 3:6] = np.eye(3)
-        by_state[:, 6:9, :3] = skew(turned(back, v))
+        by_state[:, 6:9, :3] = skew(rotate(back, v))
         by_state[:, 6:9, 6:9] = back
         by_lever = np.zeros((len(R), 9, 3))
         by_lever[:, 3:6] = R
@@ -78,7 +70,7 @@ def window() -> Window:
     return make_windows(recording.session.imu, times, [], {}, KeyframeConfig())[2]
 
 
-def partials(window: Window, m: int) -> list[Partial]:
+def partials(window: Window, m: int) -> list[PartialPreintegration]:
     bias = gtsam.imuBias.ConstantBias(np.array([0.2, -0.1, 0.05]), np.array([0.01, -0.02, 0.005]))
     at = np.linspace(window.t0_ns, window.t1_ns, m).astype(np.int64)
     return [preintegrated(window, int(t), bias, GRAVITY) for t in at]
@@ -106,7 +98,9 @@ def test_derivatives_at_an_instant(window, timed, short):
     assert_jacobians(model, states(rng, model.letters, 5, at[0].bias), data, rtol=1e-6 if short else 3e-4)
 
 
-def told(model: AtInstant, recording, times, rows, partial: Partial, offset: float | None = None) -> np.ndarray:
+def told(
+    model: AtInstant, recording, times, rows, partial: PartialPreintegration, offset: float | None = None
+) -> np.ndarray:
     """State (9,) of the probe at an instant, from the truth at the keyframe before; no lever arm, arrow along x."""
     truth = recording.truth([times])
     pose = np.eye(4)
@@ -118,7 +112,7 @@ def told(model: AtInstant, recording, times, rows, partial: Partial, offset: flo
 
 def probe(truth) -> np.ndarray:
     """What the probe sees of true states, (m, 9)."""
-    body = turned(truth.nav_R_body.transpose(0, 2, 1), truth.nav_v_body)
+    body = rotate(truth.nav_R_body.transpose(0, 2, 1), truth.nav_v_body)
     return np.concatenate([truth.nav_R_body[:, :, 0], truth.nav_t_body, body], axis=1)
 
 
@@ -152,7 +146,7 @@ def test_preintegrated_is_the_prediction_of_the_windows(window):
         np.testing.assert_allclose(v, expected.v[0], atol=3e-4)  # m/s
 
 
-def carried(truth, partial: Partial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def carried(truth, partial: PartialPreintegration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State at the end of a partial preintegration from the first row of the truth."""
     R, dt, fall = truth.nav_R_body[0], partial.dt, np.array([0.0, 0.0, -GRAVITY])
     p = truth.nav_t_body[0] + truth.nav_v_body[0] * dt + 0.5 * fall * dt**2 + R @ partial.dp

@@ -9,20 +9,15 @@ from numeric import assert_observation, random_rotations
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph import estimate
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.factors.observation import exp, left_jacobian_inverse, right_jacobian
-from smartnav_graph.factors.pose_fix import (
-    AttitudeFix,
-    PoseFixConfig,
-    at_their_time,
-    attitudes,
-)
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian
+from smartnav_graph.core.timebase import NS, ns_from_seconds
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.replay import replay
+from smartnav_graph.factors.pose_fix import AttitudeFix, PoseFixConfig, attitudes, undo_latency
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.streams import PoseFix
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.streams import PoseFix
-from smartnav_graph.timebase import NS, ns_from_seconds
 
 TURN = np.array([0.02, -0.03, 0.04])  # rad
 SIGMA_M, SIGMA_RAD = 0.02, 0.01
@@ -33,8 +28,8 @@ def fixes(recording, every_s=1.0, delay_s=0.0, seed=0, lever=LEVER, attitude=Tru
     t = np.arange(0.4, recording.trajectory.duration - 0.5, every_s)
     there = recording.trajectory.sample(t + delay_s)
     white = np.random.default_rng(seed).standard_normal((2, len(t), 3))
-    turned = Rotation.from_rotvec(SIGMA_RAD * white[0]) * Rotation.from_matrix(there.nav_R_body)
-    quat = (turned * Rotation.from_rotvec(TURN)).as_quat()[:, [3, 0, 1, 2]]
+    rotate = Rotation.from_rotvec(SIGMA_RAD * white[0]) * Rotation.from_matrix(there.nav_R_body)
+    quat = (rotate * Rotation.from_rotvec(TURN)).as_quat()[:, [3, 0, 1, 2]]
     return PoseFix(
         t_ns=START_NS + ns_from_seconds(t),
         enu=there.nav_t_body + there.nav_R_body @ np.array(lever) + SIGMA_M * white[1],
@@ -118,7 +113,7 @@ def test_known_latency_is_the_time_the_row_speaks_of(made):
     stream = fixes(made, lever=(0.0, 0.0, 0.0))
     late = replace(stream, t_ns=stream.t_ns + NS)
     config = Config(pose_fixes=PoseFixConfig(latency_s=1.0))
-    shifted = at_their_time(session_of(made, late), config.pose_fixes).pose_fixes
+    shifted = undo_latency(session_of(made, late), config.pose_fixes).pose_fixes
     assert (shifted.t_ns == stream.t_ns).all() and (shifted.arrival_ns == late.t_ns).all()
     place, turn = errors(made, sn.smooth(session_of(made, late), config))
     assert place < 0.15 and turn < 1.5  # before the first and after the last fix it is only foretold
@@ -127,10 +122,7 @@ def test_known_latency_is_the_time_the_row_speaks_of(made):
 def test_late_fixes_in_replay_are_used_at_the_time_they_speak_of(made):
     prompt = fixes(made, lever=(0.0, 0.0, 0.0))
     late = replace(prompt, arrival_ns=prompt.t_ns + NS)
-    runs = [
-        estimate.replay(session_of(made, stream), Config(replay=ReplayConfig(polish=False)))
-        for stream in (prompt, late)
-    ]
+    runs = [replay(session_of(made, stream), Config(replay=ReplayConfig(polish=False))) for stream in (prompt, late)]
     last = [run.causal.nav_t_body[-1] for run in runs]
     truth = [made.truth(run.causal.t_ns[-1:]).nav_t_body[0] for run in runs]
     # the last second is foretold twice as long; a fix taken at its arrival would be off by 1.5 m

@@ -6,9 +6,12 @@ import gtsam
 import numpy as np
 import pytest
 
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.prior import UNKNOWN_ANGLE, PriorBuilder
-from smartnav_graph.graph import Memory, State, Step, Window, key
-from smartnav_graph.timebase import NS
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
 
 ZERO = gtsam.imuBias.ConstantBias()
 # A phone on its side, pitched up by 90 deg: body and nav axes have nothing in common.
@@ -38,10 +41,10 @@ def prior(attitude: gtsam.Rot3, **changes) -> PriorBuilder:
     return PriorBuilder(State(0, NS, nav, ZERO), **{**sigmas, **changes})
 
 
-def step_of(builder: PriorBuilder, kind: str = "first") -> Step:
-    step = Step(0, NS, 0.0)
-    builder.add(step, window(kind), None, Memory())
-    return step
+def step_of(builder: PriorBuilder, kind: str = "first") -> GraphUpdate:
+    update = GraphUpdate(0, NS, 0.0)
+    builder.add(update, window(kind), None, PassState())
+    return update
 
 
 def values_at(attitude: gtsam.Rot3, position=(1.0, 2.0, 3.0), velocity=(4.0, 5.0, 6.0), bias=ZERO) -> gtsam.Values:
@@ -52,20 +55,20 @@ def values_at(attitude: gtsam.Rot3, position=(1.0, 2.0, 3.0), velocity=(4.0, 5.0
     return values
 
 
-def cost(step: Step, values: gtsam.Values) -> float:
-    return sum(factor.error(values) for _, factor in step.factors)
+def cost(update: GraphUpdate, values: gtsam.Values) -> float:
+    return sum(factor.error(values) for _, factor in update.factors)
 
 
 @pytest.mark.parametrize("attitude", ATTITUDES.values(), ids=ATTITUDES)
 @pytest.mark.parametrize("sigma_pos", [None, np.array([1.0, 2.0, 4.0])], ids=["free position", "held position"])
 @pytest.mark.parametrize("axis", range(3))
 def test_one_sigma_about_a_nav_axis_costs_a_half(attitude, sigma_pos, axis):
-    step = step_of(prior(attitude, sigma_pos=sigma_pos))
+    update = step_of(prior(attitude, sigma_pos=sigma_pos))
     turn = np.zeros(3)
     turn[axis] = [0.1, 0.2, 0.3][axis]
     moved = values_at(gtsam.Rot3.Expmap(turn).compose(attitude))
-    assert cost(step, values_at(attitude)) == pytest.approx(0.0, abs=1e-12)
-    assert cost(step, moved) == pytest.approx(0.5, rel=1e-2)
+    assert cost(update, values_at(attitude)) == pytest.approx(0.0, abs=1e-12)
+    assert cost(update, moved) == pytest.approx(0.5, rel=1e-2)
 
 
 @pytest.mark.parametrize("attitude", ATTITUDES.values(), ids=ATTITUDES)
@@ -79,15 +82,15 @@ def test_one_sigma_along_a_nav_axis_costs_a_half(attitude, axis):
 
 def test_velocity_and_bias_have_their_own_means_and_sigmas():
     mean = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.01, 0.0, 0.0]))
-    step = step_of(prior(gtsam.Rot3(), bias_mean=mean, velocity_mean=np.zeros(3)))
+    update = step_of(prior(gtsam.Rot3(), bias_mean=mean, velocity_mean=np.zeros(3)))
     off = gtsam.imuBias.ConstantBias(np.array([0.3, 0, 0]), np.array([0.06, 0.0, 0.0]))
-    assert cost(step, values_at(gtsam.Rot3(), velocity=(0, 0, 0), bias=off)) == pytest.approx(1.0, rel=1e-9)
-    assert cost(step, values_at(gtsam.Rot3(), velocity=(0.5, 0, 0), bias=mean)) == pytest.approx(0.5, rel=1e-9)
+    assert cost(update, values_at(gtsam.Rot3(), velocity=(0, 0, 0), bias=off)) == pytest.approx(1.0, rel=1e-9)
+    assert cost(update, values_at(gtsam.Rot3(), velocity=(0.5, 0, 0), bias=mean)) == pytest.approx(0.5, rel=1e-9)
 
 
 def test_the_prior_is_also_the_first_guess():
-    step = step_of(prior(ATTITUDES["any"]))
-    values = step.values()
+    update = step_of(prior(ATTITUDES["any"]))
+    values = update.values()
     np.testing.assert_allclose(values.atPose3(key("X", 0)).translation(), [1, 2, 3])
     np.testing.assert_allclose(values.atPose3(key("X", 0)).rotation().matrix(), ATTITUDES["any"].matrix())
     np.testing.assert_allclose(values.atVector(key("V", 0)), [4, 5, 6])

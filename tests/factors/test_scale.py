@@ -12,16 +12,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import smartnav_graph as sn
-from smartnav_graph.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import scale
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.factors import imu_intrinsics
 from smartnav_graph.factors.imu import ImuBuilder, ImuConfig
-from smartnav_graph.graph import Block, Memory, Window, key
-from smartnav_graph.session import Session
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import FactorBatch
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
+from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers.incremental import ReplayConfig
-from smartnav_graph.smoothers.whole_graph import Stack, custom_factor
-from smartnav_graph.timebase import NS
+from smartnav_graph.smoothers.whole_graph import StackedFactors, custom_factor
 
 NOISE = DEVICE_CLASSES["mems"]
 QUIET = replace(NOISE, accel_noise_density=2e-3, gyro_noise_density=1e-4)
@@ -55,12 +58,12 @@ BIAS = np.array([0.1, -0.2, 0.05, 0.01, -0.02, 0.03])
 
 
 def test_integration_is_that_of_the_mechanisation_and_nearly_gtsams():
-    found = scale.integrated(tumbling(), BIAS)
+    found = imu_intrinsics.integrated(tumbling(), BIAS)
     R, rest = deltas(tumbling(), BIAS, np.zeros(18))
     np.testing.assert_allclose(found.dR, R, atol=1e-12)
     np.testing.assert_allclose(np.concatenate([found.dp, found.dv]), rest, atol=1e-12)
     bias = gtsam.imuBias.ConstantBias(BIAS[:3], BIAS[3:])
-    pim = ImuBuilder(NOISE, GRAVITY).preintegrate(tumbling(), bias, Memory())
+    pim = ImuBuilder(NOISE, GRAVITY).preintegrate(tumbling(), bias, PassState())
     # GTSAM adds rotation vectors up to first order of each interval
     np.testing.assert_allclose(found.dR, pim.deltaRij().matrix(), atol=1e-4)
     np.testing.assert_allclose(found.dv, pim.deltaVij(), atol=1e-3)
@@ -69,7 +72,7 @@ def test_integration_is_that_of_the_mechanisation_and_nearly_gtsams():
 
 def test_derivatives_by_bias_scale_and_misalignment_are_the_numerical_ones():
     window, step = tumbling(), 1e-5
-    found = scale.integrated(window, BIAS)
+    found = imu_intrinsics.integrated(window, BIAS)
     for column in range(24):
         ends = []
         for sign in (1.0, -1.0):
@@ -90,7 +93,7 @@ def states(off: float, seed: int = 0) -> gtsam.Values:
     rng = np.random.default_rng(seed)
     bias = gtsam.imuBias.ConstantBias(BIAS[:3], BIAS[3:])
     first = gtsam.NavState(gtsam.Rot3.Ypr(0.3, 0.1, -0.2), np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
-    second = ImuBuilder(NOISE, GRAVITY).preintegrate(tumbling(), bias, Memory()).predict(first, bias)
+    second = ImuBuilder(NOISE, GRAVITY).preintegrate(tumbling(), bias, PassState()).predict(first, bias)
     values, delta = gtsam.Values(), gtsam.VectorValues()
     for i, nav in enumerate((first, second)):
         values.insert(key("X", i), nav.pose())
@@ -104,21 +107,21 @@ def states(off: float, seed: int = 0) -> gtsam.Values:
     return values.retract(delta)
 
 
-def row() -> tuple[Block, gtsam.ImuFactor]:
+def row() -> tuple[FactorBatch, gtsam.ImuFactor]:
     """The window as a row, and as GTSAM's factor."""
     bias = gtsam.imuBias.ConstantBias(BIAS[:3], BIAS[3:])
     builder = ImuBuilder(NOISE, GRAVITY)
-    pim = builder.preintegrate(tumbling(), bias, Memory())
-    native = builder._factor(tumbling(), pim, Memory())
+    pim = builder.preintegrate(tumbling(), bias, PassState())
+    native = builder._factor(tumbling(), pim, PassState())
     keys = (key("X", 0), key("V", 0), key("X", 1), key("V", 1), key("B", 0), key("S", 0))
-    data = scale.columns(tumbling(), BIAS, pim.preintMeasCov(), GRAVITY)
-    return Block("imu", scale.MODEL, [keys], data[None], NS), native
+    data = imu_intrinsics.columns(tumbling(), BIAS, pim.preintMeasCov(), GRAVITY)
+    return FactorBatch("imu", imu_intrinsics.MODEL, [keys], data[None], NS), native
 
 
 def test_the_residual_is_zero_at_what_the_window_foretells():
     block, _ = row()
     # the keyframes are GTSAM's; see above
-    np.testing.assert_allclose(Stack(block.model, [block], {}).linearize(states(0.0))[0], 0.0, atol=0.3)
+    np.testing.assert_allclose(StackedFactors(block.model, [block], {}).linearize(states(0.0))[0], 0.0, atol=0.3)
 
 
 def test_squares_are_those_of_gtsams_factor():
@@ -127,14 +130,14 @@ def test_squares_are_those_of_gtsams_factor():
     for seed in range(5):
         values = states(3e-3, seed)
         values.update(key("S", 0), np.zeros(18))
-        mine = Stack(block.model, [block], {}).linearize(values)[0]
+        mine = StackedFactors(block.model, [block], {}).linearize(values)[0]
         theirs = np.sum(native.whitenedError(values) ** 2)
         assert (mine**2).sum() == pytest.approx(theirs, rel=0.05)
 
 
 def test_the_derivative_of_the_row_is_the_numerical_one():
     block, _ = row()
-    values, stack, step = states(0.02), Stack(block.model, [block], {}), 1e-6
+    values, stack, step = states(0.02), StackedFactors(block.model, [block], {}), 1e-6
     found = stack.linearize(values)[1]
     for letter, name, jacobian in zip(block.model.letters, block.keys[0], found, strict=True):
         for column in range(jacobian.shape[2]):
@@ -153,7 +156,7 @@ def test_a_custom_factor_of_the_row_has_its_error():
     values = states(0.01)
     factor = custom_factor(block, 0, {})
     np.testing.assert_allclose(
-        factor.unwhitenedError(values), Stack(block.model, [block], {}).linearize(values)[0][0], atol=1e-9
+        factor.unwhitenedError(values), StackedFactors(block.model, [block], {}).linearize(values)[0][0], atol=1e-9
     )
 
 
@@ -185,7 +188,7 @@ def recovered() -> list[tuple[np.ndarray, dict]]:
 
 def test_scale_and_misalignment_are_found_within_their_sigma(recovered):
     for S, summary in recovered:
-        state = summary["states"][scale.NAME]
+        state = summary["states"][imu_intrinsics.NAME]
         value, sigma = np.array(state["value"]), np.array(state["sigma"])
         assert not state["held"] and summary["converged"]
         assert (np.abs(value - S) < 3.5 * sigma).all()
@@ -196,7 +199,7 @@ def test_scale_and_misalignment_are_found_within_their_sigma(recovered):
 def test_their_sigmas_are_honest(recovered):
     square = 0.0
     for S, summary in recovered:
-        state = summary["states"][scale.NAME]
+        state = summary["states"][imu_intrinsics.NAME]
         square += float((((np.array(state["value"]) - S) / state["sigma"]) ** 2).sum())
     low, high = chi2(18 * len(recovered)).ppf([5e-4, 1 - 5e-4])
     assert 0.5 * low < square < 1.2 * high  # elements are correlated, which widens the spread
@@ -204,7 +207,7 @@ def test_their_sigmas_are_honest(recovered):
 
 def test_what_the_motion_does_not_excite_keeps_its_prior(recovered):
     for _, summary in recovered:
-        state = summary["states"][scale.NAME]
+        state = summary["states"][imu_intrinsics.NAME]
         sigma = np.array(state["sigma"])
         assert (sigma <= SIGMA * 1.001).all() and sigma.max() > 0.7 * SIGMA
         assert state["observed"] == [bool(s < 0.7 * SIGMA) for s in sigma]
@@ -220,11 +223,11 @@ def test_errors_not_modelled_cost_chi_square(recovered):
 def test_replay_estimates_them_too():
     session, S = scaled_session(1, 40.0)
     config = replace(SCALED, replay=ReplayConfig(polish=False))
-    state = sn.run(session, config, causal=True).summary["states"][scale.NAME]
+    state = sn.run(session, config, causal=True).summary["states"][imu_intrinsics.NAME]
     assert (np.abs(np.array(state["value"]) - S) < 4.0 * np.array(state["sigma"])).all()
 
 
 def test_off_by_default_and_bounded():
-    assert scale.NAME not in sn.run(scaled_session(0, 20.0)[0]).summary["states"]
+    assert imu_intrinsics.NAME not in sn.run(scaled_session(0, 20.0)[0]).summary["states"]
     with pytest.raises(ConfigError, match=r"config \[imu\]: scale_sigma = 0.5; expected between 0 and 0.2"):
         ImuConfig(scale_sigma=0.5)

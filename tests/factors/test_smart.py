@@ -7,18 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import config
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.estimate import config
+from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.factors.coplanar_rows import Rig
 from smartnav_graph.factors.smart import FOCAL, IN_USE, SmartConfig
-from smartnav_graph.graph import Memory, Step, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.session.streams import Tracks
 from smartnav_graph.simulation.scenarios import SCENARIOS
-from smartnav_graph.streams import Tracks
 
 ROOM = SCENARIOS["room-30s"]
 EXACT = replace(ROOM, camera=replace(ROOM.camera, camera=replace(ROOM.camera.camera, noise_px=1e-9)))
-IN_FORCE = Memory(stage=1, phase="gated", settled={"smart": 1})
+IN_FORCE = PassState(stage=1, phase="gated", settled={"smart": 1})
 SIGMA = 1e-3
 
 
@@ -37,14 +39,14 @@ def smart(problem):
     return builder
 
 
-def steps(problem, builder, memory=IN_FORCE):
+def steps(problem, builder, pass_state=IN_FORCE):
     """What the builder adds to the step of every window."""
     found, previous = [], None
     for window in problem.windows:
-        step = Step(window.index, window.t1_ns, 0.0)
-        builder.add(step, window, previous, memory)
-        found.append(step)
-        previous = step
+        update = GraphUpdate(window.index, window.t1_ns, 0.0)
+        builder.add(update, window, previous, pass_state)
+        found.append(update)
+        previous = update
     return found
 
 
@@ -80,10 +82,10 @@ def test_nothing_is_left_at_the_truth(problem, factors):
 )
 def test_a_wrong_camera_is_seen(problem, name, wrong):
     builder = smart(problem)
-    right = builder.eye
-    builder.eye = replace(right, rig=wrong(right.rig))
+    right = builder.camera_model
+    builder.camera_model = replace(right, rig=wrong(right.rig))
     mistaken = [factor for step in steps(problem, builder) for _, factor in step.factors]
-    builder.eye = right
+    builder.camera_model = right
     values = truth(problem)
     assert np.median([factor.error(values) for factor in mistaken]) > 3.0
 
@@ -133,8 +135,8 @@ def test_a_point_is_searched_to_the_end(problem):
 
 def test_tracks_join_once_they_are_judged(problem):
     builder = smart(problem)
-    for memory in (Memory(stage=1), replace(IN_FORCE, phase="causal")):
-        assert not any(step.factors for step in steps(problem, builder, memory))
+    for pass_state in (PassState(stage=1), replace(IN_FORCE, phase="causal")):
+        assert not any(step.factors for step in steps(problem, builder, pass_state))
     builder.verdict[::2] = 0 * builder.verdict[::2] + 1
     some = steps(problem, builder)
     assert sum(len(step.factors) for step in some) == (builder.verdict == IN_USE).sum()

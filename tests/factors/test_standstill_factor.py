@@ -8,14 +8,17 @@ import pytest
 from exact import assert_derivative
 from numeric import assert_observation, random_rotations
 
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.config import Config
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.standstill import ANYWHERE, TAIL, Level, StandstillBuilder, build
-from smartnav_graph.graph import Memory, State, Step, Window, key
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State, key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.detect.standstills import StandstillConfig, Standstills, find_standstills
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.standstill import StandstillConfig, Standstills, find_standstills
-from smartnav_graph.timebase import NS
 
 T_NS = np.arange(0, 5 * NS, NS // 100)
 STILL = (T_NS >= NS) & (T_NS <= 3 * NS)
@@ -33,10 +36,10 @@ def at(seconds, index=0, height=0.0, speed=0.0):
 
 def step_of(builder, start, end, kind="normal", height=0.0, index=1):
     window = Window(index, round(start * NS), round(end * NS), kind, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    step = Step(index, window.t1_ns, end)
-    step.predicted = at(end, index, height).nav
-    builder.add(step, window, None if kind == "first" else at(start, index - 1), Memory())
-    return step
+    update = GraphUpdate(index, window.t1_ns, end)
+    update.predicted = at(end, index, height).nav
+    builder.add(update, window, None if kind == "first" else at(start, index - 1), PassState())
+    return update
 
 
 @pytest.mark.parametrize(
@@ -51,14 +54,14 @@ def step_of(builder, start, end, kind="normal", height=0.0, index=1):
     ],
 )
 def test_what_is_added_where(start, end, kind, sensors):
-    step = step_of(StandstillBuilder(rests()), start, end, kind)
-    assert [tag.sensor for tag, _ in step.factors] == sensors and not step.blocks
+    update = step_of(StandstillBuilder(rests()), start, end, kind)
+    assert [tag.sensor for tag, _ in update.factors] == sensors and not update.blocks
 
 
 @pytest.mark.parametrize(("option", "left"), [("zupt", ["static_turn"]), ("zaru", ["static"])])
 def test_each_can_be_left_out(option, left):
-    step = step_of(StandstillBuilder(rests(), StandstillConfig(**{option: False})), 1.0, 2.0)
-    assert [tag.sensor for tag, _ in step.factors] == left
+    update = step_of(StandstillBuilder(rests(), StandstillConfig(**{option: False})), 1.0, 2.0)
+    assert [tag.sensor for tag, _ in update.factors] == left
 
 
 def values(speed=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), height=0.0):
@@ -113,7 +116,12 @@ def test_all_stances_of_a_foot_are_on_one_floor():
     assert second.session == first.session  # one state, one prior
     (block,) = second.blocks
     residual, _ = block.model.linearize(
-        [np.eye(4)[None] + 2.03 * np.eye(4)[2:3].T @ np.eye(4)[3:4], np.zeros((1, 3)), np.array([[2.0]])], block.data
+        [
+            np.eye(4)[None] + 2.03 * np.eye(4)[2:3].T @ np.eye(4)[3:4],
+            np.zeros((1, 3)),
+            np.array([[2.0]]),
+        ],
+        block.data,
     )
     assert residual == pytest.approx(1.5)  # 3 cm of 2 cm
     assert not step_of(StandstillBuilder(rests(), StandstillConfig(flat_floor=True)), 1.0, 2.0).blocks  # no foot
@@ -129,5 +137,5 @@ def context(**options):
 
 def test_a_builder_only_where_something_stands_still():
     assert isinstance(build(context()), StandstillBuilder)
-    assert build(context(detect=False, listed=False)) is None
+    assert build(context(detect=False, use_listed=False)) is None
     assert build(replace(context(), rests=None)) is None

@@ -10,19 +10,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph import frames
-from smartnav_graph.calibration.model import Calibration, StepNoise
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.factors import step as step_factor
+from smartnav_graph.core import frames
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.factors import pedestrian as step_factor
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.step import StepBuilder, StepConfig, Stride, level_yaw, model_of
-from smartnav_graph.graph import Memory, State, Step, Window
+from smartnav_graph.factors.pedestrian import StepBuilder, StepConfig, Stride, level_yaw, model_of
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import Calibration, StepNoise
+from smartnav_graph.session.detect.steps import Steps
+from smartnav_graph.session.streams import ControlPoint
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.scenarios import Scenario
-from smartnav_graph.steps import Steps
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import NS
 
 PHONE = frames.body_R_vehicle("+y", "+z")
 
@@ -94,12 +97,14 @@ def builder(**changes) -> StepBuilder:
     return StepBuilder(**{**values, **changes})
 
 
-def add(made: StepBuilder, window: Window, R=None, bias: float = 0.0, memory: Memory | None = None) -> Step:
+def add(
+    made: StepBuilder, window: Window, R=None, bias: float = 0.0, pass_state: PassState | None = None
+) -> GraphUpdate:
     nav = gtsam.NavState(gtsam.Pose3(gtsam.Rot3(np.eye(3) if R is None else R), np.zeros(3)), np.zeros(3))
     state = State(0, window.t0_ns, nav, gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, bias])))
-    step = Step(1, window.t1_ns, 1.0)
-    made.add(step, window, state, memory or Memory())
-    return step
+    update = GraphUpdate(1, window.t1_ns, 1.0)
+    made.add(update, window, state, pass_state or PassState())
+    return update
 
 
 def test_the_length_follows_a_turn_within_the_window():
@@ -150,7 +155,7 @@ def test_a_stand_is_a_row_of_no_length_and_no_row_stands_in_a_gap_or_upside_down
 def test_good_fixes_close_together_need_no_steps(fixes_s, batch, causal):
     made = builder(fixes_ns=(np.array(fixes_s) * NS).astype(np.int64))
     assert bool(add(made, turning(0.0)).blocks) == batch
-    assert bool(add(made, turning(0.0), memory=Memory(phase="causal")).blocks) == causal
+    assert bool(add(made, turning(0.0), pass_state=PassState(phase="causal")).blocks) == causal
 
 
 # --- who walks --------------------------------------------------------------------------------------------------------

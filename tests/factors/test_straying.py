@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from exact import GRAVITY
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.factors.bridging import Bridge
+from smartnav_graph.core.timebase import NS, Gap
+from smartnav_graph.factors.gap_error import Straying, row
+from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.factors.imu import ImuBuilder
-from smartnav_graph.factors.straying import Straying, row
-from smartnav_graph.graph import Memory, Step, Window, key
-from smartnav_graph.smoothers.whole_graph import Stack
-from smartnav_graph.timebase import NS, Gap
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.smoothers.whole_graph import StackedFactors
 
 NOISE = DEVICE_CLASSES["mems"]
 GAP = Gap(10 * NS, 14 * NS, "missing")
@@ -37,12 +40,12 @@ def test_the_chain_is_a_brownian_bridge():
     times, straying = [10.0, 10.5, 11.7, 13.0, 14.0], Straying()
     graph, values, names = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
     for k in range(1, len(times)):
-        step = Step(k, round(times[k] * NS), times[k])
-        found = straying.add(step, window(k, times[k - 1], times[k]), GAP, BRIDGE)
+        update = GraphUpdate(k, round(times[k] * NS), times[k])
+        found = straying.add(update, window(k, times[k - 1], times[k]), GAP, BRIDGE)
         assert found == (k > 1, k < 4)
-        for _, factor in step.factors:
+        for _, factor in update.factors:
             graph.push_back(factor)
-        for name, value in step.chain.items():
+        for name, value in update.chain.items():
             values.insert(name, value)
             names.append(name)
     joint = gtsam.Marginals(graph, values).jointMarginalCovariance(names)
@@ -61,7 +64,7 @@ def test_a_row_holds_where_the_readings_were_off_by_what_strayed(ends):
     true = replace(read, kind="normal", accel=read.accel + more[:, :3], gyro=read.gyro + more[:, 3:])
     builder = ImuBuilder(NOISE, GRAVITY)
     first = gtsam.NavState(gtsam.Rot3.Ypr(0.3, 0.1, -0.2), np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
-    second = builder.preintegrate(true, bias, Memory()).predict(first, bias)
+    second = builder.preintegrate(true, bias, PassState()).predict(first, bias)
     values = gtsam.Values()
     for i, nav in enumerate((first, second)):
         values.insert(key("X", i), nav.pose())
@@ -69,24 +72,27 @@ def test_a_row_holds_where_the_readings_were_off_by_what_strayed(ends):
         values.insert(key("G", i), strayed[i])
     values.insert(key("B", 0), bias)
     block = row(read, ends, bias, np.eye(9) * 1e-4, GRAVITY)
-    residual, jacobians = Stack(block.model, [block], {}).linearize(values)
+    residual, jacobians = StackedFactors(block.model, [block], {}).linearize(values)
     np.testing.assert_allclose(residual * 1e-2, 0.0, atol=4e-4)  # rad, m, m/s; second order
     bare = values
     for i in range(2):
         bare.update(key("G", i), np.zeros(6))
-    assert np.abs(Stack(block.model, [block], {}).linearize(bare)[0] * 1e-2).max() > 5e-3
+    assert np.abs(StackedFactors(block.model, [block], {}).linearize(bare)[0] * 1e-2).max() > 5e-3
     assert len(jacobians) == 5 + sum(ends)
 
 
 def test_nothing_strays_where_nothing_is_learnt():
-    step = Step(1, 11 * NS, 11.0)
-    assert Straying().add(step, window(1, 10.0, 11.0), GAP, replace(BRIDGE, wander=np.zeros((6, 6)))) == (False, False)
-    assert not step.chain and not step.factors
+    update = GraphUpdate(1, 11 * NS, 11.0)
+    assert Straying().add(update, window(1, 10.0, 11.0), GAP, replace(BRIDGE, wander=np.zeros((6, 6)))) == (
+        False,
+        False,
+    )
+    assert not update.chain and not update.factors
 
 
 def test_a_new_pass_knows_nothing_of_the_one_before():
     builder = ImuBuilder(NOISE, GRAVITY, [GAP], {GAP.start_ns: BRIDGE})
     builder._straying.known.add(3)
     first = Window(0, 0, 0, "first", np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    builder.add(Step(0, 0, 0.0), first, None, Memory())
+    builder.add(GraphUpdate(0, 0, 0.0), first, None, PassState())
     assert not builder._straying.known

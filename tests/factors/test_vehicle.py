@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from numeric import assert_observation, random_rotations
 
-from smartnav_graph.calibration.model import VEHICLE_CLASSES
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import body_R_vehicle
+from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors.vehicle import MOUNT_SIZE, NonHolonomic, VehicleBuilder, VehicleConfig, recent
-from smartnav_graph.frames import body_R_vehicle
-from smartnav_graph.graph import Memory, Step, Window, key
-from smartnav_graph.standstill import Standstills
-from smartnav_graph.timebase import NS, Gap
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.calibration.model import VEHICLE_CLASSES
+from smartnav_graph.session.detect.standstills import Standstills
 
 PHONE = NonHolonomic(body_R_vehicle("+y", "+z"))
 COMMA = NonHolonomic(body_R_vehicle("+x", "-z"))
@@ -112,11 +115,11 @@ def window(t0_s: float, t1_s: float) -> Window:
     return Window(3, round(t0_s * NS), round(t1_s * NS), "normal", np.full(n, 0.01), accel, gyro)
 
 
-def rows(builder: VehicleBuilder, at: Window, memory: Memory | None = None) -> list:
-    step = Step(at.index, at.t1_ns, at.t1_ns / NS)
-    step.bias = gtsam.imuBias.ConstantBias(np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.0, 0.1]))
-    builder.add(step, at, None, memory or Memory(stage=1))
-    return step.blocks
+def rows(builder: VehicleBuilder, at: Window, pass_state: PassState | None = None) -> list:
+    update = GraphUpdate(at.index, at.t1_ns, at.t1_ns / NS)
+    update.bias = gtsam.imuBias.ConstantBias(np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.0, 0.1]))
+    builder.add(update, at, None, pass_state or PassState(stage=1))
+    return update.blocks
 
 
 def car(**options) -> VehicleBuilder:
@@ -132,8 +135,8 @@ def test_a_row_holds_rate_and_force_of_the_last_moments_without_bias():
 
 
 def test_noise_found_from_the_data_scales_each_row():
-    memory = Memory(stage=1, noise_scales={"vehicle_lateral": 2.0, "vehicle_vertical": 3.0})
-    (block,) = rows(car(), window(10.0, 11.0), memory)
+    pass_state = PassState(stage=1, noise_scales={"vehicle_lateral": 2.0, "vehicle_vertical": 3.0})
+    (block,) = rows(car(), window(10.0, 11.0), pass_state)
     noise = VEHICLE_CLASSES["car"]
     assert block.data[0, 6:] == pytest.approx([2 * noise.lateral_sigma, 3 * noise.vertical_sigma])
 
@@ -150,9 +153,9 @@ def test_no_row_inside_a_gap_of_which_nothing_is_known_but_one_at_its_end():
 
 
 def test_a_row_inside_a_gap_rests_on_what_readings_stray_by():
-    step, at = Step(3, 11 * NS, 11.0), window(10.0, 11.0)
+    step, at = GraphUpdate(3, 11 * NS, 11.0), window(10.0, 11.0)
     step.bias, step.chain[key("G", 3)] = gtsam.imuBias.ConstantBias(), np.zeros(6)
-    car(gaps=[Gap(round(10.4 * NS), 13 * NS, "missing")]).add(step, at, None, Memory(stage=1))
+    car(gaps=[Gap(round(10.4 * NS), 13 * NS, "missing")]).add(step, at, None, PassState(stage=1))
     (block,) = step.blocks
     assert block.model.letters[2:] == ("M", "G") and block.keys[0][3] == key("G", 3)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numeric import assert_observation, random_rotations
 
+from smartnav_graph.core.frames import body_R_vehicle
 from smartnav_graph.factors.vehicle import MOUNT_SIZE
 from smartnav_graph.factors.wheel import RearWheels
-from smartnav_graph.frames import body_R_vehicle
 
 MODEL = RearWheels(body_R_vehicle("+y", "+z"))
 

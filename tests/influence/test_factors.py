@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.influence import Influence, held
-from smartnav_graph.influence.factors import builder_of
+from smartnav_graph.evaluation.influence import Influence, held
+from smartnav_graph.evaluation.influence.factors import builder_of
 
 OPTIONS = {"end_s": 20.0, "initial": "0,0,0,0,3,30"}
 

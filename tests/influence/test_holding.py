@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import SolverError
-from smartnav_graph.graph import key
-from smartnav_graph.influence import CALIBRATION, Group, Influence, Keyframes, held
+from smartnav_graph.core.errors import SolverError
+from smartnav_graph.evaluation.influence import CALIBRATION, Group, Influence, Keyframes, held
+from smartnav_graph.graph.states import key
 
 EAST = 3  # of the fifteen components
 UPRIGHT = np.eye(3)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SmartnavError
+from smartnav_graph.core.errors import SmartnavError
 
 CAMERAS = "# cameras\n1 SIMPLE_RADIAL 100 80 90 50 40 -0.1\n2 OPENCV_FISHEYE 100 80 90 91 50 40 1 2 3 4\n"
 TURN = Rotation.from_euler("y", 30, degrees=True)

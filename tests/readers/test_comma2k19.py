@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import heading_pitch_roll_deg
-from smartnav_graph.timebase import interpolate
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import heading_pitch_roll_deg
+from smartnav_graph.core.timebase import interpolate
 
 LAT, LON, HEIGHT = 37.72, -122.47, 33.0
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")

@@ -7,10 +7,10 @@ import pytest
 import tomli_w
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
-from smartnav_graph.frames import Origin
-from smartnav_graph.session import Device, Session, load, save
-from smartnav_graph.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference, Stream
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.session.session import Device, Session, load, save
+from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference, Stream
 
 T = np.array([1403715273262142976, 1403715273267142912, 1403715273272142976])
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import CalibrationError, SessionError
-from smartnav_graph.frames import axis_vector
+from smartnav_graph.core.errors import CalibrationError, SessionError
+from smartnav_graph.core.frames import axis_vector
 from smartnav_graph.readers.source import example_file
-from smartnav_graph.session import load, save
+from smartnav_graph.session.session import load, save
 
 T_BS = """%YAML:1.0
 sensor_type: camera

@@ -5,7 +5,7 @@ import pytest
 from scipy.io import savemat
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 
 # Rows typed from measData (MIT licence, Hu and Hu 2025): sample 5028 of the recording.
 LEFT = [0.331804215908051, 0.778443872928619, 9.87296390533447, 0.00894264110794468, 0.0062325470051393]

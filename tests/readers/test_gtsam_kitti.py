@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.gtsam_kitti import GNSS_FILE, IMU_FILE
 from smartnav_graph.readers.source import example_file
 

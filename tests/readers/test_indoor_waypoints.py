@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from smartnav_graph import readers
-from smartnav_graph.calibration.model import DEVICE_CLASSES
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.indoor_waypoints import polled_noise
-from smartnav_graph.streams import Imu
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.streams import Imu
 
 HEADING = """#\tstartTime:1574668577059
 #\tSiteID:5dd3\tSiteName:\u897f\u6eaa\tFloorId:5dd4\tFloorName:B1

@@ -6,7 +6,7 @@ import tarfile
 import pytest
 
 from smartnav_graph import readers
-from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.readers.source import example_file
 
 IMU = "t_ns,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2\n"

@@ -6,11 +6,11 @@ from evo.core.geometry import umeyama_alignment
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.readers.reference import load_reference, load_transform
-from smartnav_graph.session import Session, save
-from smartnav_graph.streams import Reference
-from smartnav_graph.timebase import interpolate
+from smartnav_graph.session.session import Session, save
+from smartnav_graph.session.streams import Reference
 
 # forward-left-up body; the camera looks ahead, 1.1 m in front of and 0.7 m above the IMU
 BODY_T_CAM = np.array([[0.0, 0, 1, 1.1], [-1, 0, 0, -0.3], [0, -1, 0, 0.7], [0, 0, 0, 1]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.text import read_text
 
 

@@ -8,9 +8,9 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import SessionError
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.evaluation.align import fit
-from smartnav_graph.timebase import interpolate
 
 TURN = Rotation.from_euler("z", 90, degrees=True)  # body x points north
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from drive_case import Drive, drive
 
-from smartnav_graph.report import write_report
+from smartnav_graph.output.report import write_report
 
 
 @pytest.fixture(scope="session")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.frames import Origin
-from smartnav_graph.session import Device, Session
-from smartnav_graph.solution import Residuals, Solution
-from smartnav_graph.streams import GnssFix, Imu
-from smartnav_graph.trace import Updates
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.estimate.result.diagnostics import Updates
+from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.session.session import Device, Session
+from smartnav_graph.session.streams import GnssFix, Imu
 
 T0 = 46_534_478_375_790
 HOLES = [(36.4, 1.59, "bridged"), (198.7, 1.62, "bridged"), (219.7, 1.5, "bridged"), (307.8, 2.41, "missing")]

@@ -13,13 +13,13 @@ from drive_case import HOLES, REJECTED, Scored, drive, summary
 from lxml import html
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.report import facts, report_markdown, write_report
-from smartnav_graph.report.statistics import accelerations
-from smartnav_graph.report.timeline import lanes
-from smartnav_graph.session import Session
-from smartnav_graph.solution import Residuals, Solution
-from smartnav_graph.streams import Imu
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.output.report import facts, report_markdown, write_report
+from smartnav_graph.output.report.statistics import accelerations
+from smartnav_graph.output.report.timeline import lanes
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Imu
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_percentiles_lie_on_the_curve(tmp_path, case) -> None:
 
 
 def test_map_marks_the_rejected_fixes_where_they_are(dom, case) -> None:
-    from smartnav_graph.report.track import fix_states
+    from smartnav_graph.output.report.track import fix_states
 
     xy, state = fix_states(case.session, case.solution)["gnss"]
     assert np.flatnonzero(state == "rejected").tolist() == list(REJECTED)

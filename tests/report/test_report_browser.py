@@ -16,7 +16,7 @@ import pytest
 from drive_case import drive
 
 from smartnav_graph.cli import main
-from smartnav_graph.report import write_report
+from smartnav_graph.output.report import write_report
 
 CHROMIUM = shutil.which("chromium")
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import T0, make_session, make_solution, truth, write
 
-from smartnav_graph.rerun_log import blueprint, recorder, spatial
+from smartnav_graph.output.rerun_log import blueprint, recorder, spatial
 
 
 def test_every_view_has_data_and_every_kind_of_data_a_view(recording):

@@ -9,7 +9,7 @@ from recordings import (
     write,
 )
 
-from smartnav_graph.streams import Images, Tracks
+from smartnav_graph.session.streams import Images, Tracks
 
 
 def test_images_and_pixel_tracks_lie_over_each_other(tmp_path):

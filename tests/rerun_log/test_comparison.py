@@ -7,7 +7,7 @@ import pytest
 from recordings import Recording, make_solution
 
 from smartnav_graph.evaluation.compare import compare
-from smartnav_graph.rerun_log.comparison import PLOTS, write_comparison
+from smartnav_graph.output.rerun_log.comparison import PLOTS, write_comparison
 
 SHIFT = np.array([0.5, -0.25, 0.125])
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from recordings import T0, make_session, make_solution, stamps, write
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.result.diagnostics import Diagnostics, ImagePairs
 from smartnav_graph.factors.coplanarity import CONTRARY, FEW, IN_USE, STILL
-from smartnav_graph.rerun_log import colours, pairs
-from smartnav_graph.session import Mount
-from smartnav_graph.streams import Images, Matches
-from smartnav_graph.timebase import NS
-from smartnav_graph.trace import SeenPairs, Trace
+from smartnav_graph.output.rerun_log import colours, pairs
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Mount
+from smartnav_graph.session.streams import Images, Matches
 from smartnav_graph.vision.pairs import Pairs
 
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0)
@@ -46,7 +46,7 @@ def seen_session(**changes):
 def trace_of(verdict=VERDICT):
     from recordings import NO_WIRING
 
-    return Trace(make_solution().t_ns, NO_WIRING, pairs=SeenPairs("cam0", PAIRS, USE, verdict))
+    return Diagnostics(make_solution().t_ns, NO_WIRING, pairs=ImagePairs("cam0", PAIRS, USE, verdict))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_camera_sits_on_the_body_and_sees_as_calibrated(found):
 
 def test_of_pairs_of_one_image_the_shortest_in_use_is_shown():
     def shown(*verdict):
-        return pairs.shown(SeenPairs("cam0", PAIRS, USE, np.array(verdict))).tolist()
+        return pairs.shown(ImagePairs("cam0", PAIRS, USE, np.array(verdict))).tolist()
 
     assert shown(IN_USE, IN_USE, IN_USE, IN_USE, IN_USE) == [0, 2, 3, 4]
     assert shown(IN_USE, IN_USE, CONTRARY, IN_USE, IN_USE) == [0, 1, 3, 4]

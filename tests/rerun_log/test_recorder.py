@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from recordings import EVALUATION, SUMMARY, T0, N, make_session, make_solution, replayed, stamps, write
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.rerun_log import recorder, viewer, write_recording
-from smartnav_graph.solution import Residuals
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.graph.solution import Residuals
+from smartnav_graph.output.rerun_log import recorder, viewer, write_recording
 
 
 def test_time_lines_count_from_time_zero_and_stand_everywhere(recording):
@@ -97,7 +97,7 @@ def test_existing_file_is_kept_without_force(tmp_path):
 
 
 def test_importing_the_package_does_not_load_rerun():
-    code = "import sys, smartnav_graph, smartnav_graph.rerun_log; print('rerun' in sys.modules)"
+    code = "import sys, smartnav_graph, smartnav_graph.output.rerun_log; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

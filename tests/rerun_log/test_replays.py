@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from recordings import EVALUATION, N, Recording, make_session, make_solution, replayed, updates, write
 
-from smartnav_graph.rerun_log import replays, viewer, write_latency
-from smartnav_graph.trace import Updates
+from smartnav_graph.estimate.result.diagnostics import Updates
+from smartnav_graph.output.rerun_log import replays, viewer, write_latency
 
 
 @pytest.fixture(scope="module")

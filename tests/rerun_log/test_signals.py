@@ -10,8 +10,8 @@ from recordings import (
     make_solution,
 )
 
-from smartnav_graph.rerun_log import signals
-from smartnav_graph.solution import POS, Residuals
+from smartnav_graph.graph.solution import POS, Residuals
+from smartnav_graph.output.rerun_log import signals
 
 
 def test_biases_and_errors_carry_their_variances(recording):

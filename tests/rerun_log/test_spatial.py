@@ -13,9 +13,9 @@ from recordings import (
 )
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.rerun_log import spatial
-from smartnav_graph.solution import POS
-from smartnav_graph.streams import GnssFix
+from smartnav_graph.graph.solution import POS
+from smartnav_graph.output.rerun_log import spatial
+from smartnav_graph.session.streams import GnssFix
 
 
 def test_poses_are_the_solution_row_by_row(recording):

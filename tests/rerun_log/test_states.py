@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from recordings import T0, make_solution, replayed, updates, write
 
-from smartnav_graph.rerun_log import states
+from smartnav_graph.output.rerun_log import states
 
 FOUND = {
     "gnss_time_offset_s": {"value": 0.06, "sigma": 0.002, "held": False},

@@ -15,10 +15,10 @@ from recordings import (
     write,
 )
 
-from smartnav_graph.rerun_log import events
-from smartnav_graph.solution import Residuals
-from smartnav_graph.streams import ControlPoint
-from smartnav_graph.timebase import NS, Gap
+from smartnav_graph.core.timebase import NS, Gap
+from smartnav_graph.graph.solution import Residuals
+from smartnav_graph.output.rerun_log import events
+from smartnav_graph.session.streams import ControlPoint
 
 
 def test_legend_names_what_is_drawn_and_nothing_else(recording):

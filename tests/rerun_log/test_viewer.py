@@ -9,9 +9,9 @@ from recordings import (
     make_session,
 )
 
-from smartnav_graph import session as sessions
-from smartnav_graph.errors import SessionError, SmartnavError
-from smartnav_graph.rerun_log import viewer
+from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.output.rerun_log import viewer
+from smartnav_graph.session import session as sessions
 
 
 def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):

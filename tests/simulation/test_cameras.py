@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation import cameras, motions
 from smartnav_graph.simulation.cameras import CameraModel, Faults
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.simulation.scenes import FurnishedRoom
-from smartnav_graph.timebase import NS
 
 ROOM = SCENARIOS["room-30s"]
 EXACT = replace(ROOM.camera, pairs=(1, 2), faults=Faults())

@@ -5,18 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph import session
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.simulation.degrade import (
-    Degrade,
-    degrade,
-    parse_outliers,
-    parse_pair,
-    spoil_rows,
-    write_degraded,
-)
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.session import session
+from smartnav_graph.session.streams import GnssFix
+from smartnav_graph.simulation.degrade import Degrade, degrade, parse_outliers, parse_pair, spoil_rows, write_degraded
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.streams import GnssFix
 
 N = 6000
 

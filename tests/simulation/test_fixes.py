@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError
-from smartnav_graph.frames import LocalFrame, Origin
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.simulation import fixes, motions
 from smartnav_graph.simulation.fixes import GnssModel, Outliers
-from smartnav_graph.timebase import ns_from_seconds
 
 FRAME = LocalFrame(Origin(52.0, 11.0, 100.0))
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph import session
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.session import session
+from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation import cameras, recording, render
 from smartnav_graph.simulation.cameras import CameraModel, PictureModel
 from smartnav_graph.simulation.scenarios import SCENARIOS

@@ -8,11 +8,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
-from smartnav_graph import session
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session import session
 from smartnav_graph.simulation.recording import magnetic_field_ut
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
-from smartnav_graph.timebase import NS
 
 # Force m/s^2, height m, field uT and pressure hPa of the first samples of walk-60s, seed 3.
 GOLDEN = [-0.4846241127340646, 95.72895993292332, -16.798879451632178, 1001.4255208012221]

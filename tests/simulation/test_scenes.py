@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.simulation import scenes
 from smartnav_graph.simulation.scenes import Box, CorridorGrid, FurnishedRoom
 

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from smartnav_graph.calibration.model import DEVICE_CLASSES
+from smartnav_graph.core.timebase import ns_from_seconds
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Truth
-from smartnav_graph.timebase import ns_from_seconds
 
 N = 120_000
 T_NS = ns_from_seconds(np.arange(N) / 100)

@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
-from smartnav_graph.timebase import ns_from_seconds
 
 GRAVITY = 9.81
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.simulation.recording import constants
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.simulation.sensors import PROFILES
-from smartnav_graph.timebase import NS
 
 TROLLEY = SCENARIOS["trolley-20min"]
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph import estimate as loop
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import Memory, build_step, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import build_update
 from smartnav_graph.smoothers.batch import Batch, BatchConfig, check_covariance
 from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.minimise import SolveConfig
@@ -26,14 +28,14 @@ def problem():
 
 @pytest.fixture(scope="module")
 def prior(problem):
-    return loop.initialise(problem).prior
+    return initialise(problem).prior
 
 
-def fill(problem, prior, batch: Batch, change=lambda step: None) -> Batch:
+def fill(problem, prior, batch: Batch, change=lambda update: None) -> Batch:
     for window in problem.windows:
-        step = build_step(window, batch.latest(), [prior, *problem.builders], Memory(), problem.session.t0_ns)
-        change(step)
-        batch.update(step)
+        update = build_update(window, batch.latest(), [prior, *problem.builders], PassState(), problem.session.t0_ns)
+        change(update)
+        batch.update(update)
     return batch
 
 
@@ -44,7 +46,9 @@ def test_nothing_is_known_before_the_first_step():
 def test_the_latest_state_is_that_of_the_last_step(problem, prior):
     batch = Batch(t0_ns=problem.session.t0_ns)
     for window in problem.windows[:4]:
-        batch.update(build_step(window, batch.latest(), [prior, *problem.builders], Memory(), problem.session.t0_ns))
+        batch.update(
+            build_update(window, batch.latest(), [prior, *problem.builders], PassState(), problem.session.t0_ns)
+        )
         assert (batch.latest().index, batch.latest().t_ns) == (window.index, window.t1_ns)
 
 
@@ -65,7 +69,7 @@ def test_warm_values_ten_kilometres_off(problem, prior):
         pose = away.atPose3(key("X", i))
         shift = pose.translation() + np.array([7_000.0, -7_000.0, 300.0])
         away.update(key("X", i), gtsam.Pose3(pose.rotation(), shift))
-    again = fill(problem, prior, Batch(solve=FINE, warm=away)).estimate()
+    again = fill(problem, prior, Batch(solve=FINE, initial_values=away)).estimate()
     metres, degrees = largest_difference(solved, again)
     assert metres < 1e-3 and degrees < 5e-3 and again.converged
 

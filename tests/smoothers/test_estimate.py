@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph import estimate as loop
-from smartnav_graph.config import Config
-from smartnav_graph.graph import KEYFRAME_LETTERS, Memory, State, Step, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.passes import solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, State, key
+from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers import estimate as room
 from smartnav_graph.smoothers.whole_graph import custom_factor
 
@@ -18,8 +21,8 @@ from smartnav_graph.smoothers.whole_graph import custom_factor
 @pytest.fixture(scope="module")
 def solved():
     problem = prepare(record(seed=0, fix_sigma=0.1).session, Config())
-    initial = loop.initialise(problem)
-    return loop.solve_passes(problem, problem.windows, initial.prior, Memory())[0]
+    initial = initialise(problem)
+    return solve_passes(problem, problem.windows, initial.prior, PassState())[0]
 
 
 def test_a_state_goes_into_values_and_comes_back():
@@ -152,7 +155,7 @@ def test_another_complaint_keeps_its_words():
 
 
 def test_the_order_names_every_state_once():
-    steps = [Step(i, 0, 0.0) for i in range(11)]
+    steps = [GraphUpdate(i, 0, 0.0) for i in range(11)]
     steps[3].chain = {key("C", 3): np.zeros(3)}
     order = room.chronological_order(steps)
     names = [order.at(i) for i in range(order.size())]

@@ -10,22 +10,25 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph import estimate as loop
-from smartnav_graph.config import Config
-from smartnav_graph.errors import SolverError
+from smartnav_graph.core.errors import SolverError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.passes import one_pass, solve_passes
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.graph import SENSORS, Block, Memory, build_step, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import SENSORS, key
+from smartnav_graph.graph.update import FactorBatch, build_update
 from smartnav_graph.simulation import motions
 from smartnav_graph.smoothers import fixed_lag, incremental
 from smartnav_graph.smoothers.batch import Batch
 from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
-from smartnav_graph.timebase import NS
 
 FINE = SolveConfig(max_iterations=100, tolerance=1e-14, step_tolerance=1e-9)
-ALL = Memory(stage=1)
+ALL = PassState(stage=1)
 T, L = (key(letter, SENSORS.index("gnss")) for letter in "TL")
 DELAY_S = 0.06
 
@@ -42,27 +45,27 @@ def problem():
 @pytest.fixture(scope="module")
 def steps(problem):
     """Steps built once, at the batch solution: preintegration and delays depend on the state they are made at."""
-    prior = loop.initialise(problem, 30.0).prior.placed()
-    solved, _, _ = loop.solve_passes(problem, problem.windows, prior, ALL)
-    smoother = Batch(warm=solved.values, t0_ns=problem.session.t0_ns)
-    loop.one_pass(smoother, problem.windows, [prior, *problem.builders], ALL, problem)
-    for step in smoother.steps:
-        step.refresh = None  # never again
+    prior = initialise(problem, 30.0).prior.placed()
+    solved, _, _ = solve_passes(problem, problem.windows, prior, ALL)
+    smoother = Batch(initial_values=solved.values, t0_ns=problem.session.t0_ns)
+    one_pass(smoother, problem.windows, [prior, *problem.builders], ALL, problem)
+    for update in smoother.steps:
+        update.refresh = None  # never again
     return smoother.steps
 
 
 @pytest.fixture(scope="module")
 def batch(problem, steps):
     smoother = Batch(solve=FINE, t0_ns=problem.session.t0_ns)
-    for step in steps:
-        smoother.update(step)
+    for update in steps:
+        smoother.update(update)
     return smoother.estimate()
 
 
 def replayed(steps, watch=lambda smoother: None, **options):
     smoother = incremental(ReplayConfig("fixed-lag", **options), steps[0].t_ns)
-    for step in steps:
-        smoother.update(replace(step, blocks=list(step.blocks)))
+    for update in steps:
+        smoother.update(replace(update, blocks=list(update.blocks)))
         watch(smoother)
     return smoother
 
@@ -87,8 +90,8 @@ def test_a_lag_longer_than_the_recording_is_batch(steps, batch):
 
 def test_isam2_with_session_states_converges_to_batch(steps, batch):
     smoother = incremental(ReplayConfig("isam2", relinearize=1e-7, hold=False), steps[0].t_ns)
-    for step in steps:
-        smoother.update(replace(step, blocks=list(step.blocks)))
+    for update in steps:
+        smoother.update(replace(update, blocks=list(update.blocks)))
     for _ in range(10):
         smoother._engine.update()  # nothing new: iSAM2 goes on relinearising
     estimate = smoother.estimate()
@@ -143,8 +146,8 @@ def test_marginalising_keeps_the_latest_covariance(steps):
 def test_held_states_are_constants(problem, steps):
     held = {"gnss_time_offset_s": np.array([DELAY_S])}
     made = []
-    for step in steps[:20]:
-        copy = replace(step, blocks=list(step.blocks), session=dict(step.session), held={}, constants={})
+    for update in steps[:20]:
+        copy = replace(update, blocks=list(update.blocks), session=dict(update.session), held={}, constants={})
         copy.hold(held)
         made.append(copy)
     estimate = replayed(made, lag_s=5.0).estimate()
@@ -171,7 +174,9 @@ def test_rows_of_keyframes_that_have_left_are_counted_and_left_out(steps):
     """One block with rows of an old, an inner and the present keyframe: the old one alone is dropped."""
     smoother = replayed(steps[:30], lag_s=5.0)
     oldest, step = smoother._inside[0].index, steps[30]
-    rows = Block("level", LEVEL, [(key("X", i),) for i in (3, oldest + 3, 30)], np.zeros((3, 1)), 0, rows=(7, 8, 9))
+    rows = FactorBatch(
+        "level", LEVEL, [(key("X", i),) for i in (3, oldest + 3, 30)], np.zeros((3, 1)), 0, rows=(7, 8, 9)
+    )
     smoother.update(replace(step, blocks=[*step.blocks, rows]))
     assert smoother.dropped == {"level": 1}
     kept = smoother.steps[-1].blocks[-1]
@@ -185,8 +190,10 @@ def test_rows_of_keyframes_that_have_left_are_counted_and_left_out(steps):
 
 def test_isam2_holds_what_touches_every_step(steps):
     smoother = incremental(ReplayConfig("isam2"), steps[0].t_ns)
-    for step in steps[:15]:
-        smoother.update(replace(step, blocks=list(step.blocks), session=dict(step.session), held={}, constants={}))
+    for update in steps[:15]:
+        smoother.update(
+            replace(update, blocks=list(update.blocks), session=dict(update.session), held={}, constants={})
+        )
     found = smoother.estimate().session
     assert all(state.held for state in found.values()) and found["gnss_time_offset_s"].value == 0.0
 
@@ -201,7 +208,7 @@ def test_a_step_that_is_no_number_names_its_state():
 
 def test_a_broken_measurement_is_told_with_its_time(steps):
     smoother = replayed(steps[:5])
-    bad = Block("level", LEVEL, [(key("X", 5),)], np.full((1, 1), np.nan), 0)
+    bad = FactorBatch("level", LEVEL, [(key("X", 5),)], np.full((1, 1), np.nan), 0)
     step = steps[5]
     with pytest.raises(SolverError, match=r"t = \d+\.\d\d s: .* not determined there \(keyframe \d, touched by"):
         smoother.update(replace(step, blocks=[*step.blocks, bad]))
@@ -209,9 +216,9 @@ def test_a_broken_measurement_is_told_with_its_time(steps):
 
 def test_steps_are_built_on_what_is_known(problem):
     """End to end: the loop's own order of latest, build, update."""
-    prior = loop.initialise(problem, 30.0).prior.placed()
+    prior = initialise(problem, 30.0).prior.placed()
     smoother = incremental(ReplayConfig("fixed-lag", lag_s=8.0), problem.session.t0_ns)
     for window in problem.windows[:20]:
-        step = build_step(window, smoother.latest(), [prior, *problem.builders], ALL, problem.session.t0_ns)
-        smoother.update(step)
+        update = build_update(window, smoother.latest(), [prior, *problem.builders], ALL, problem.session.t0_ns)
+        smoother.update(update)
         assert smoother.latest().index == window.index and np.isfinite(smoother.known().covariance).all()

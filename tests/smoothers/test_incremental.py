@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from exact import record
 
-from smartnav_graph import estimate as loop
-from smartnav_graph.config import Config
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import KEYFRAME_LETTERS, Memory, Tag, build_step, key
-from smartnav_graph.problem import prepare
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.estimate.run import initialise
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, key
+from smartnav_graph.graph.update import FactorId, build_update
 from smartnav_graph.simulation import motions
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.batch import Batch
@@ -25,13 +27,13 @@ def problem():
 
 @pytest.fixture(scope="module")
 def prior(problem):
-    return loop.initialise(problem, 30.0).prior.placed()
+    return initialise(problem, 30.0).prior.placed()
 
 
 def fill(problem, prior, smoother, watch=lambda smoother: None):
     for window in problem.windows:
         latest = smoother.latest()
-        smoother.update(build_step(window, latest, [prior, *problem.builders], Memory(), problem.session.t0_ns))
+        smoother.update(build_update(window, latest, [prior, *problem.builders], PassState(), problem.session.t0_ns))
         watch(smoother)
     return smoother
 
@@ -59,7 +61,7 @@ def test_a_fixed_lag_keeps_its_lag_and_no_more(problem, prior):
         sizes.append(smoother._live.size())
 
     smoother = fill(problem, prior, incremental(ReplayConfig("fixed-lag", lag_s=10.0), problem.session.t0_ns), watch)
-    spacing = np.diff([step.t_s for step in smoother.steps]).min()
+    spacing = np.diff([update.t_s for update in smoother.steps]).min()
     most = (10.0 / spacing + 2) * len(KEYFRAME_LETTERS)
     assert max(sizes) <= most and len(smoother._inside) <= 10.0 / spacing + 2
     middle, last = sizes[len(sizes) // 2], sizes[-1]
@@ -91,11 +93,13 @@ def test_the_estimate_of_the_first_keyframes(problem, prior):
 def test_a_state_without_factors_is_told(problem, prior, kind):
     """No prior and no fix: nothing holds the first state."""
     smoother = incremental(ReplayConfig(kind), problem.session.t0_ns)
-    step = build_step(problem.windows[0], None, [prior, *problem.builders], Memory(), problem.session.t0_ns)
+    update = build_update(problem.windows[0], None, [prior, *problem.builders], PassState(), problem.session.t0_ns)
     name = key("X", 0)
-    step.factors = [(Tag("imu", step.t_ns), gtsam.GPSFactor(name, np.zeros(3), gtsam.noiseModel.Unit.Create(3)))]
+    update.factors = [
+        (FactorId("imu", update.t_ns), gtsam.GPSFactor(name, np.zeros(3), gtsam.noiseModel.Unit.Create(3)))
+    ]
     with pytest.raises(SolverError, match=r"t = 0\.00 s: .* not determined there \(keyframe 0, touched by imu\)"):
-        smoother.update(step)
+        smoother.update(update)
 
 
 def test_nothing_processed_is_an_error():

@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError, SolverError
-from smartnav_graph.graph import key
+from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.graph.states import key
 from smartnav_graph.smoothers.minimise import SolveConfig, minimise
 
 X, V = key("X", 0), key("V", 0)
@@ -129,7 +129,7 @@ def test_a_start_that_is_not_finite_is_refused(value):
 
 
 def test_a_shot_is_taken_where_the_step_fails():
-    """`shoot` offers the minimum itself: one iteration is enough."""
+    """`reintegrate` offers the minimum itself: one iteration is enough."""
     solve = minimise(
         rosenbrock(),
         at((V, np.array([-1.2, 1.0, 0.0]))),

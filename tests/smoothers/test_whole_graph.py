@@ -9,11 +9,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from smartnav_graph.graph import Block, SessionState, Step, key
-from smartnav_graph.losses import huber_limit, loss_weights
+from smartnav_graph.graph.robust import huber_limit, loss_weights
+from smartnav_graph.graph.states import SessionState, key
+from smartnav_graph.graph.update import FactorBatch, GraphUpdate
 from smartnav_graph.smoothers.whole_graph import (
     Snapshot,
-    Stack,
+    StackedFactors,
     WholeGraph,
     custom_factor,
     linear_factor,
@@ -71,9 +72,10 @@ def keys(i: int) -> tuple[int, ...]:
     return (*(key(letter, i) for letter in "XVBC"), LEVER.key)
 
 
-def block(rng: np.random.Generator, count: int = 4, **changes) -> Block:
+def block(rng: np.random.Generator, count: int = 4, **changes) -> FactorBatch:
     return replace(
-        Block("probe", MODEL, [keys(i) for i in range(count)], rng.normal(0, 2, (count, 3)), 0, range(count)), **changes
+        FactorBatch("probe", MODEL, [keys(i) for i in range(count)], rng.normal(0, 2, (count, 3)), 0, range(count)),
+        **changes,
     )
 
 
@@ -84,7 +86,7 @@ def information(linear: gtsam.GaussianFactorGraph, at: gtsam.Values) -> tuple[np
     return linear.hessian(order)
 
 
-def one_by_one(blocks: Sequence[Block], held, priors=()) -> gtsam.NonlinearFactorGraph:
+def one_by_one(blocks: Sequence[FactorBatch], held, priors=()) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for b in blocks:
         for row in np.flatnonzero(b.used):
@@ -172,7 +174,7 @@ def test_rows_not_used_have_residuals_and_nothing_else():
 def test_what_nothing_depends_on_is_not_tied():
     """A row that does not feel a state does not make it look observed."""
     at = values(np.random.default_rng(0))
-    rows = Block("blind", BLIND, [(key("V", i), key("C", i)) for i in range(4)], np.zeros((4, 3)), 0)
+    rows = FactorBatch("blind", BLIND, [(key("V", i), key("C", i)) for i in range(4)], np.zeros((4, 3)), 0)
     linear = WholeGraph([], [rows], {}).linearize(at)
     assert set(linear.keys()) == {key("C", i) for i in range(4)}
 
@@ -186,17 +188,17 @@ def test_blocks_are_joined_by_sensor_model_and_loss():
         ("probe", "huber", 4),
         ("other", "none", 4),
     ]
-    assert [b.t_ns for b in found[0].blocks] == [0, 0] and isinstance(found[0], Stack)
+    assert [b.t_ns for b in found[0].blocks] == [0, 0] and isinstance(found[0], StackedFactors)
 
 
 def test_a_graph_of_steps_has_the_prior_of_each_session_state_once():
     rng = np.random.default_rng(4)
     at, steps = values(rng), []
     for i in range(4):
-        step = Step(i, 0, 0.0)
-        step.use(LEVER)
-        step.blocks.append(block(rng, 4, keys=[keys(i)] * 4))
-        steps.append(step)
+        update = GraphUpdate(i, 0, 0.0)
+        update.use(LEVER)
+        update.blocks.append(block(rng, 4, keys=[keys(i)] * 4))
+        steps.append(update)
     mine = WholeGraph.of(steps)
     single = one_by_one([b for s in steps for b in s.blocks], {}, [session_prior(LEVER)])
     np.testing.assert_allclose(
@@ -207,18 +209,18 @@ def test_a_graph_of_steps_has_the_prior_of_each_session_state_once():
 
 def test_a_held_state_is_a_constant_without_a_prior():
     rng = np.random.default_rng(4)
-    step = Step(0, 0, 0.0)
-    step.use(LEVER)
-    step.blocks.append(block(rng, 1))
-    step.hold({LEVER.name: np.array([1.0, 2.0, 3.0])})
+    update = GraphUpdate(0, 0, 0.0)
+    update.use(LEVER)
+    update.blocks.append(block(rng, 1))
+    update.hold({LEVER.name: np.array([1.0, 2.0, 3.0])})
     at = values(rng, 1)
     at.erase(LEVER.key)  # nobody asks for it
-    graph = WholeGraph.of([step])
+    graph = WholeGraph.of([update])
     linear = graph.linearize(at)
     assert graph.native.size() == 0 and LEVER.key not in set(linear.keys())
     with_state = gtsam.Values(at)
     with_state.insert(LEVER.key, np.array([1.0, 2.0, 3.0]))
-    (free,) = stacks_of(step.blocks, {})
+    (free,) = stacks_of(update.blocks, {})
     np.testing.assert_array_equal(graph.stacks[0].linearize(at)[0], free.linearize(with_state)[0])
 
 

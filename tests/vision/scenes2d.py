@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.session import Session, load, save
-from smartnav_graph.streams import Images, Imu
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Session, load, save
+from smartnav_graph.session.streams import Images, Imu
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 PERIOD_NS = 250_000_000

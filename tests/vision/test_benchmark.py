@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 import smartnav_graph as sn
 from smartnav_graph.cli import main
 from smartnav_graph.cli.match import print_scores
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.session import Mount
-from smartnav_graph.streams import Reference
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.session.session import Mount
+from smartnav_graph.session.streams import Reference
 from smartnav_graph.vision import benchmark
 from smartnav_graph.vision.benchmark import CameraPoses, score, true_matches
 from smartnav_graph.vision.front_end import FrontEndConfig

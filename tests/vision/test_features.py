@@ -6,8 +6,8 @@ import pytest
 from scenes2d import CAMERA, centred, moved, seen, texture
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.vision import features, matching
 
 PLANE = texture()

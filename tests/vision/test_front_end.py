@@ -11,11 +11,11 @@ from scenes2d import CAMERA, PERIOD_NS, centred, moved, png, seen, session_of, t
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
-from smartnav_graph.errors import ConfigError, SessionError
-from smartnav_graph.session import Mount
-from smartnav_graph.streams import Imu
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.session.session import Mount
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.vision.front_end import FrontEndConfig, find
-from smartnav_graph.vision.pool import ordered, threads
+from smartnav_graph.vision.parallel import ordered, threads
 
 PLANE = texture(seed=5, size=1200)
 # each picture is the one before, turned and shifted

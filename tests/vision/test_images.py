@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scenes2d import CAMERA, centred, jpeg, png, seen, session_of, texture
 
-from smartnav_graph.errors import SessionError
-from smartnav_graph.session import Session
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.session import Session
 from smartnav_graph.vision import images
 from smartnav_graph.vision.images import Judge, Look, Picture
 

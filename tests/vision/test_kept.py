@@ -8,11 +8,11 @@ import pytest
 from scenes2d import CAMERA, centred, seen, session_of, texture
 
 import smartnav_graph as sn
-from smartnav_graph.calibration import model as calibration_model
 from smartnav_graph.cli import main
-from smartnav_graph.errors import SessionError
-from smartnav_graph.session import write_table
-from smartnav_graph.vision import kept
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.calibration import model as calibration_model
+from smartnav_graph.session.session import write_table
+from smartnav_graph.vision import match_store
 from smartnav_graph.vision.front_end import FrontEndConfig
 
 PLANE = texture(seed=7)
@@ -25,7 +25,7 @@ CONFIG = FrontEndConfig(count=150, spans=(1,))
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kept") / "s"
     session_of(PICTURES, folder)
-    return folder, kept.match(folder, CONFIG)
+    return folder, match_store.match(folder, CONFIG)
 
 
 @pytest.fixture
@@ -38,8 +38,8 @@ def test_a_second_call_reads_what_the_first_one_kept(made, folder, monkeypatch):
     def never(*_args, **_options):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(kept, "find", never)
-    again = kept.match(folder, CONFIG)
+    monkeypatch.setattr(match_store, "find", never)
+    again = match_store.match(folder, CONFIG)
     assert made[1].computed and not again.computed
     assert again.report == made[1].report
     for name, column in made[1].matches.columns().items():
@@ -49,7 +49,7 @@ def test_a_second_call_reads_what_the_first_one_kept(made, folder, monkeypatch):
 
 def refused(folder, config=CONFIG) -> str:
     with pytest.raises(SessionError) as caught:
-        kept.match(folder, config)
+        match_store.match(folder, config)
     assert "add --force to replace it" in str(caught.value)
     return str(caught.value)
 
@@ -58,16 +58,16 @@ def test_other_options_are_refused_and_force_replaces(folder):
     other = FrontEndConfig(count=150, spans=(1, 2), policy="thesis")
     text = refused(folder, other)
     assert "matches.parquet: was made with policy ratio (asked for: thesis), spans [1] (asked for: [1, 2])" in text
-    assert kept.match(folder, other, force=True).computed
-    assert not kept.match(folder, other).computed
+    assert match_store.match(folder, other, force=True).computed
+    assert not match_store.match(folder, other).computed
     assert "policy thesis (asked for: ratio)" in refused(folder)
 
 
 def test_tracks_stand_beside_matches(folder):
-    found = kept.match(folder, FrontEndConfig(features="klt", count=50))
+    found = match_store.match(folder, FrontEndConfig(features="klt", count=50))
     session = sn.load(folder)
     assert found.computed and len(session.tracks) == len(found.tracks) and len(session.matches)
-    assert not kept.match(folder, FrontEndConfig(features="klt", count=50)).computed
+    assert not match_store.match(folder, FrontEndConfig(features="klt", count=50)).computed
 
 
 def test_changed_pictures_or_calibration_are_noticed(folder):
@@ -75,7 +75,7 @@ def test_changed_pictures_or_calibration_are_noticed(folder):
     (folder / "calibration.toml").write_text(calibration.replace("fx = 300.0", "fx = 301.0"))
     assert "was made with other pictures or another calibration" in refused(folder)
     (folder / "calibration.toml").write_text(calibration)
-    assert not kept.match(folder, CONFIG).computed
+    assert not match_store.match(folder, CONFIG).computed
     shutil.copy(folder / "images" / "000.png", folder / "images" / "003.png")
     assert "was made with other pictures or another calibration" in refused(folder)
 

@@ -6,11 +6,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.calibration.model import Calibration
-from smartnav_graph.errors import SessionError, SolverError
-from smartnav_graph.session import Mount, Session
-from smartnav_graph.streams import GnssFix, Images
+from smartnav_graph.core.errors import SessionError, SolverError
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.session import Mount, Session
+from smartnav_graph.session.streams import GnssFix, Images
 from smartnav_graph.vision.map import Known, own_fixes, pose_fixes
 
 COUNT = 12

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.errors import SessionError
-from smartnav_graph.streams import Images
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Images
 from smartnav_graph.vision import match_file
 from smartnav_graph.vision.match_file import Sensor
 

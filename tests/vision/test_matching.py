@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.vision import matching
 
 

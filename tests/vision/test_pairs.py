@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.streams import Matches, Tracks
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.streams import Matches, Tracks
 from smartnav_graph.vision.pairs import of_matches, of_tracks
 
 

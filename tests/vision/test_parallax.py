@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from view_pairs import FORWARD, NOWHERE, SIDEWAYS, SIGMA, view
 
-from smartnav_graph.vision.consensus_pair import directions
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.parallax import faced, in_front, parallax
+from smartnav_graph.vision.ransac import directions
 from smartnav_graph.vision.refine import Matched
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.streams import Tracks
+from smartnav_graph.session.streams import Tracks
 from smartnav_graph.vision.points import Cameras, Sightings, meet, of_tracks
 
 SIGMA = 1e-3

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from smartnav_graph.streams import Tracks
-from smartnav_graph.timebase import NS
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.streams import Tracks
 from smartnav_graph.vision.pairs import of_tracks
-from smartnav_graph.vision.still import STILL, still_periods
+from smartnav_graph.vision.zero_motion import STILL, still_periods
 
 RATE = 10
 

@@ -9,8 +9,8 @@ import pytest
 from scenes2d import CAMERA, centred, moved, seen, texture, turning
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.calibration.camera import Camera
-from smartnav_graph.streams import Imu
+from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.vision import tracking
 from smartnav_graph.vision.tracking import Gyro, Tracker
 

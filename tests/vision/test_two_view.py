@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from view_pairs import FORWARD, NOWHERE, SHORT, SIDEWAYS, SIGMA, turned, view
 
-from smartnav_graph.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.vision.refine import (
     Epipolar,
     Matched,

@@ -1,0 +1,81 @@
+"""Reading what people write by hand, and writing that never leaves a half-written file in place of a good one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from smartnav_graph.core.errors import SessionError, SmartnavError
+
+
+def read_toml(path: Path, fault: type[SmartnavError], what: str) -> dict[str, Any]:
+    """The tables of a TOML file; `what` it should be (``a config.toml``) is part of the `fault` raised otherwise."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise fault(path, f"cannot be read ({error.strerror})", what) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise fault(path, f"is no TOML ({error})", what) from error
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Raise unless `path` is free (or an empty folder), or may be replaced."""
+    taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
+    if taken and not force:
+        raise SessionError(path, "exists already", "a new name", "choose another --out, or add --force to replace it")
+
+
+@contextmanager
+def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; move it into place only when the block ends well.
+
+    Works for files and for folders (create the one wanted at the yielded path). On any failure, an interrupt or a
+    full disk included, the temporary is removed and what stood at `path` is untouched.
+
+    Raises
+    ------
+    SessionError
+        `path` exists and `force` is not given, or the system refuses to write.
+    """
+    path = Path(path)
+    refuse_existing(path, force)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise SessionError(path, f"cannot be written ({error.strerror})", "a writable place") from error
+    new = scratch / path.name
+    try:
+        yield new
+        if path.is_dir():
+            os.replace(path, scratch / "replaced")
+        os.replace(new, path)
+    except OSError as error:
+        if (scratch / "replaced").exists() and not path.exists():
+            os.replace(scratch / "replaced", path)
+        raise SessionError(
+            path,
+            f"could not be written ({error.strerror or error})",
+            "room on the disk and permission to write",
+            "nothing was changed; free some space or choose another place",
+        ) from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def refuse_foreign(path: str | Path, mark: str) -> None:
+    """Raise where `path` is a folder with something in it, but not the `mark` file of the kind to be replaced.
+
+    Keeps a mistyped ``--out`` with ``--force`` from replacing a folder of somebody's own.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or (path / mark).is_file())):
+        raise SessionError(
+            path, f"holds no {mark}, so it is not replaced", f"a new name or a folder with {mark}", "remove it yourself"
+        )

@@ -1,0 +1,48 @@
+"""Rotations row by row: products, exponential map, skew matrices and the Jacobians of SO(3).
+
+Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.core.arrays import Floats
+
+
+def skew(v: Floats) -> Floats:
+    """Cross-product matrices (m, 3, 3) of vectors (m, 3)."""
+    zero = np.zeros(len(v))
+    rows = [zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def exp(w: Floats) -> Floats:
+    """Rotation matrices (m, 3, 3) of rotation vectors (m, 3)."""
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+
+
+def rotate(R: Floats, v: Floats) -> Floats:
+    """R v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", R, v))
+
+
+def left_jacobian_inverse(theta: Floats) -> Floats:
+    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
+    factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
+
+
+def right_jacobian(theta: Floats) -> Floats:
+    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
+    square = (theta**2).sum(axis=1)
+    angle = np.sqrt(np.maximum(square, 1e-16))
+    one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
+    two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
+    cross = skew(theta)
+    return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)

@@ -1,0 +1,159 @@
+"""One clock a session: int64 nanoseconds. Decimal text -> t_ns, association, interpolation, gaps.
+
+Nothing here knows sensors; arrays go in, arrays come out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.errors import SessionError
+
+NS = 1_000_000_000
+
+
+def ns_from_text(text: str, unit_ns: int = NS) -> int:
+    """Nanoseconds of a decimal clock reading, rounded half to even.
+
+    Binary floats cannot hold nanoseconds of a Unix epoch; decimal text can.
+
+    Parameters
+    ----------
+    text : str
+        Decimal number in units of `unit_ns`.
+    unit_ns : int
+        Nanoseconds in one unit of `text` (1e9 for seconds, 1 for nanoseconds).
+
+    Raises
+    ------
+    SessionError
+        The text is no finite number.
+    """
+    try:
+        value = Decimal(text.strip()) * unit_ns
+        ns = int(value.quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
+    except (InvalidOperation, ValueError) as error:  # ValueError: nan
+        raise SessionError("time stamp", f"{text!r} is no number", "a decimal number of seconds") from error
+    if abs(ns) >= 2**63:
+        raise SessionError("time stamp", f"{text!r} does not fit int64 nanoseconds", "within 292 years of the epoch")
+    return ns
+
+
+def ns_from_texts(texts: Sequence[str], unit_ns: int = NS) -> Times:
+    """`ns_from_text` of every element; shape (n,)."""
+    return np.array([ns_from_text(text, unit_ns) for text in texts], dtype=np.int64)
+
+
+def ns_from_seconds(seconds: ArrayLike) -> Times:
+    """Nanoseconds of float seconds (for spans and simulated clocks, not for epochs)."""
+    return np.asarray(np.rint(np.asarray(seconds, dtype=np.float64) * NS), dtype=np.int64)
+
+
+def seconds_since(t_ns: ArrayLike, t0_ns: int) -> Floats:
+    """Float seconds since `t0_ns`; exact to a nanosecond within 100 days."""
+    return np.asarray(np.asarray(t_ns, dtype=np.int64) - t0_ns, dtype=np.float64) / NS
+
+
+def interpolate(t_ns: ArrayLike, at_ns: ArrayLike, values: ArrayLike) -> Floats:
+    """Linear interpolation of rows `values` (n, k) or (n,) given at `at_ns` to the times `t_ns`.
+
+    Outside the span the end values hold.
+    """
+    at = np.asarray(at_ns, dtype=np.int64)
+    t0 = int(at[0])
+    x, xp = seconds_since(t_ns, t0), seconds_since(at, t0)
+    rows = np.asarray(values, dtype=np.float64)
+    if rows.ndim == 1:
+        return np.asarray(np.interp(x, xp, rows), dtype=np.float64)
+    return np.stack([np.interp(x, xp, column) for column in rows.T], axis=-1)
+
+
+def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> NDArray[np.intp]:
+    """Index into the sorted `at_ns` of the time nearest to each of `t_ns`."""
+    t, at = np.asarray(t_ns, dtype=np.int64), np.asarray(at_ns, dtype=np.int64)
+    right = np.clip(np.searchsorted(at, t), 1, max(len(at) - 1, 1))
+    if len(at) < 2:
+        return np.zeros(t.shape, dtype=np.intp)
+    return np.where(t - at[right - 1] <= at[right] - t, right - 1, right)
+
+
+# Rows between two straight stretches that make them one.
+MENDED_ROWS = 4
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A stretch without honest inertial data.
+
+    kind is ``missing`` (no samples) or ``bridged`` (samples are an exact straight line: somebody interpolated).
+    """
+
+    start_ns: int
+    end_ns: int
+    kind: str
+
+    @property
+    def length_s(self) -> float:
+        return (self.end_ns - self.start_ns) / NS
+
+
+def find_gaps(
+    t_ns: Times,
+    values: Floats,
+    *,
+    missing_s: float = 0.05,
+    missing_periods: float = 3.0,
+    bridged_rows: int = 5,
+    straightness: float = 1e-3,
+) -> list[Gap]:
+    """Find missing and straight-line-filled stretches of a sampled signal.
+
+    Missing: a step longer than both `missing_s` and `missing_periods` median periods.
+    Bridged: at least `bridged_rows` successive rows that lie on one straight line of the k-dimensional signal space:
+    successive differences, each axis in units of its median step, are parallel within `straightness` rad, and every
+    axis moves from row to row (constant and quantised stretches do not count). No honest inertial sensor does that,
+    and the rule does not depend on the stamps, which may be jittered. Stretches that a few rows part, as two that were
+    swapped do, are one.
+
+    Parameters
+    ----------
+    t_ns : (n,) int64, strictly increasing
+    values : (n, k) samples; for an IMU the six axes in SI units
+    """
+    if len(t_ns) < 2:
+        return []
+    dt = np.diff(t_ns) / NS
+    limit = max(missing_s, missing_periods * float(np.median(dt)))
+    gaps = [Gap(int(t_ns[i]), int(t_ns[i + 1]), "missing") for i in np.flatnonzero(dt > limit)]
+
+    step = np.diff(values, axis=0)
+    unit = np.median(np.abs(step[:: max(1, len(step) // 20_000)]), axis=0)
+    step /= np.where(unit > 0, unit, 1.0)
+    length = np.sqrt(np.einsum("ij,ij->i", step, step))
+    cosine = np.einsum("ij,ij->i", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-300)
+    straight = cosine > np.cos(straightness)
+    moving = (step[1:] != 0.0).all(axis=1)
+    padded = np.concatenate([[False], straight & moving, [False]])
+    starts = np.flatnonzero(~padded[:-1] & padded[1:])
+    ends = np.flatnonzero(padded[:-1] & ~padded[1:])
+    # k parallel pairs span k + 2 rows
+    long = ends - starts + 2 >= bridged_rows
+    gaps += [Gap(int(t_ns[i]), int(t_ns[j]), "bridged") for i, j in _mended(starts[long], ends[long] + 1)]
+    return sorted(gaps, key=lambda gap: gap.start_ns)
+
+
+def _mended(first: NDArray[np.intp], last: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """Stretches of rows, joined where hardly any row lies between: two that were swapped break a straight line."""
+    joined: list[tuple[int, int]] = []
+    for i, j in zip(first.tolist(), last.tolist(), strict=True):
+        if joined and i - joined[-1][1] <= MENDED_ROWS:
+            joined[-1] = (joined[-1][0], j)
+        else:
+            joined.append((i, j))
+    return joined

@@ -1,0 +1,126 @@
+"""Replay: one window at a time, causal, with an optional final batch solution."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.core.progress import Progress, silent, watched
+from smartnav_graph.estimate.alignment.initial_state import InitialState
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.passes import Clock, _no_collection, solve_passes
+from smartnav_graph.estimate.problem import TOO_LATE, Problem, prepare, recut
+from smartnav_graph.estimate.result.assemble import (
+    carried_over,
+    causal_solution,
+)
+from smartnav_graph.estimate.result.diagnostics import UpdateLog
+from smartnav_graph.estimate.result.solved import SolvedProblem
+from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.estimate.run import Run, _finish, initialise
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.states import State
+from smartnav_graph.graph.update import build_update
+from smartnav_graph.session.session import Session
+from smartnav_graph.smoothers import incremental
+from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
+
+# A polish that moves a state further than this starts anew from what it found.
+FAR_M, FAR_DEG = 0.1, 1.0
+
+
+def replay(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
+    """One window at a time, causal but for the initialisation stretch (at most 30 s); an interrupt leaves what is done.
+
+    Raises
+    ------
+    SessionError, ConfigError, SolverError
+        As `smooth`.
+    """
+    clock = Clock()
+    progress("preparing", 0, 0)
+    problem = prepare(session, config or Config(), causal=True)
+    clock.lap("prepare")
+    progress("finding the start", 0, 0)
+    initial = initialise(problem, longest_s=30.0)
+    clock.lap("initialise")
+    options = problem.config.replay
+    smoother = incremental(options, problem.session.t0_ns)
+    builders = [initial.prior.placed(), *problem.builders]
+    wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.pass_state))
+    pass_state = replace(initial.pass_state, phase="causal", correlated=wandering, stage=LAST_STAGE)
+    log = UpdateLog()
+    states: list[State] = []
+    interrupted = False
+    try:
+        with _no_collection():  # a pause of Python's would be a late update
+            for window in watched("replay", problem.windows, progress):
+                begin = time.perf_counter()
+                previous = states[-1] if states else None
+                update = build_update(window, previous, builders, pass_state, problem.session.t0_ns)
+                smoother.update(update)
+                states.append(smoother.known())
+                log.take(update, smoother, time.perf_counter() - begin)
+    except KeyboardInterrupt:
+        interrupted = True
+        if len(states) < 2:
+            raise
+    clock.lap("replay")
+    problem = _counted(replace(problem, windows=problem.windows[: len(states)]), smoother.dropped)
+    estimate = smoother.estimate(len(states))
+    causal, windows, updates = causal_solution(problem, states), problem.windows, log.updates()
+    extra: dict[str, Any] = {
+        "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
+        "update_ms": {name: float(f(log.latency_ms)) for name, f in _LATENCY.items()},
+        "delay_s": initial.stretch_s,
+    }
+    if options.polish:
+        try:
+            last = problem.windows[-1].t1_ns if interrupted else None
+            problem, estimate, pass_state, extra["polish"] = _polished(problem, estimate, initial, last, progress)
+        except KeyboardInterrupt:
+            extra["mode"] += ", polish interrupted"
+        clock.lap("polish")
+    run = _finish(SolvedProblem(problem, estimate, pass_state), initial, clock, extra, causal, updates)
+    return replace(run, causal_windows=windows)
+
+
+def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:
+    """The problem with the rows that came too late for the smoother."""
+    streams = problem.session.streams()
+    counts = {name: count for name, count in too_late.items() if count and name in streams}
+    return problem.with_dropped(TOO_LATE, counts)
+
+
+def _polished(
+    problem: Problem, estimate: Estimate, initial: InitialState, available_ns: int | None, progress: Progress
+) -> tuple[Problem, Estimate, PassState, dict[str, float]]:
+    """Everything once more by batch, every row at the time it speaks of, and how far that moved the estimate.
+
+    What is made at the states before (preintegrated windows, delayed fixes) is made anew where they moved far.
+    """
+    whole = recut(problem, available_ns)
+    initial_values = estimate.values if whole is problem else carried_over(problem, estimate, whole.windows)
+    pass_state, total = initial.pass_state, 0
+    told: dict[str, float] = {}
+    while True:
+        found, pass_state, passes = solve_passes(
+            whole, whole.windows, initial.prior, pass_state, initial_values=initial_values, progress=progress
+        )
+        metres, degrees = distance(states_of(initial_values, found.indices), found.states())
+        told = told or {"largest_change_m": metres, "largest_change_deg": degrees}
+        total += passes
+        if (metres < FAR_M and degrees < FAR_DEG) or total >= whole.config.run.passes:
+            return whole, found, pass_state, {**told, "passes": total}
+        initial_values = found.values
+
+
+_LATENCY: Mapping[str, Callable[[Sequence[float]], Any]] = {
+    "median": np.median,
+    "p99": lambda values: np.percentile(values, 99),
+    "max": np.max,
+}

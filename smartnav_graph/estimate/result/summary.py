@@ -1,0 +1,279 @@
+"""What happened in one run, as summary.json tells it."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.estimate.alignment.initial_state import InitialState
+from smartnav_graph.estimate.problem import Problem
+from smartnav_graph.estimate.result.assemble import Withheld, used_counts
+from smartnav_graph.estimate.result.rejections import rejections
+from smartnav_graph.estimate.result.solved import SolvedProblem
+from smartnav_graph.estimate.reweight import track_outliers
+from smartnav_graph.estimate.reweight.constraint_noise import noise_groups
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account, account
+from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
+from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
+from smartnav_graph.estimate.reweight.update import OBSERVED
+from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
+from smartnav_graph.factors.gauss_markov import wander_sigma
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.solution import POS, Solution
+from smartnav_graph.smoothers.estimate import Estimate
+
+PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
+STATE_DIM = 15
+# Chi-square per degree of freedom that no tolerable noise model explains: residuals twice their sigma.
+MISFIT = 4.0
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the result depends on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def peak_memory_mb() -> float:
+    """Largest resident set of this process, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
+
+
+def _chi2_per_dof(
+    solved: SolvedProblem, solution: Solution, seen: Account | None, tracks: track_outliers.Account | None
+) -> dict[str, float]:
+    """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
+
+    Unknowns are the states less the equations that chains and priors bring with them. The redundancy of a fix is what
+    its posterior leaves of its variance; the inertial factors have the rest.
+    """
+    estimate, pass_state = solved.estimate, solved.pass_state
+    rows = {
+        sensor: solution.residuals.of(sensor) & solution.residuals.used for sensor in set(solution.residuals.sensor)
+    }
+    squares = {
+        sensor: float((solution.residuals.weight[mask] * solution.residuals.whitened[mask] ** 2).sum())
+        for sensor, mask in rows.items()
+    }
+    count = sum(int(mask.sum()) for mask in rows.values())
+    # the position is free of any prior; each chain and session state has one equation of its own
+    eliminated = POINT_DOF * tracks.points if tracks is not None and tracks.in_force else 0
+    total = max(count - eliminated - STATE_DIM * len(estimate.indices) + 12, 1)
+    result = {"overall": 2.0 * estimate.cost / total}
+    left = float(total)
+    if seen is not None and seen.redundancy > 0:
+        left -= seen.redundancy
+        inside = rows.get("coplanarity", np.zeros(0, dtype=bool))  # within their gate; the loss would make it too small
+        result["coplanarity"] = float((solution.residuals.whitened[inside] ** 2).sum()) / seen.redundancy
+    if tracks is not None and tracks.in_force:
+        left -= tracks.redundancy
+        result[SMART] = squares.get(SMART, 0.0) / tracks.redundancy
+    for builder in position_builders(solved.problem.builders):
+        if builder.name in pass_state.correlated:
+            continue
+        found = solved.fixes[builder.name]
+        used = pass_state.used(builder.name, found.rows)
+        redundancy = float(found.redundancy[used].sum())
+        left -= redundancy
+        if redundancy > 0.5:
+            result[builder.name] = squares.get(builder.name, 0.0) / redundancy
+    inertial = squares.get("imu", 0.0) + squares.get("imu_bias", 0.0)
+    if left > 0.5 and not pass_state.correlated:
+        result["imu"] = inertial / left
+    return {name: round(value, 5) for name, value in result.items()}
+
+
+def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
+    """What speaks against the solution."""
+    doubts = []
+    if not absolute:
+        doubts.append(
+            "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
+        )
+    if not estimate.converged:
+        doubts.append("solve: the iteration limit was reached before the cost settled; raise solve.max_iterations")
+    if chi2 > MISFIT:
+        doubts.append(
+            f"solve: chi-square per degree of freedom is {chi2:.1f}, about 1 is expected: the measurements contradict "
+            "each other or their sigmas are too small; check units, axes and clocks with `smartnav info`"
+        )
+    return doubts
+
+
+def summarise(
+    solved: SolvedProblem,
+    initial: InitialState,
+    keyframes: Solution,
+    withheld: Mapping[str, Withheld],
+    timings: Mapping[str, float],
+    extra: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The content of summary.json; `extra` overrides and adds."""
+    problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
+    t0 = problem.session.t0_ns
+    duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
+    factors: dict[str, int] = {}
+    for tag, _ in estimate.factors:
+        factors[tag.sensor] = factors.get(tag.sensor, 0) + 1
+    for block in estimate.blocks:
+        factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
+    absolute = bool(used_counts(problem, pass_state))
+    seen, tracks = account(problem.builders, pass_state), track_outliers.account(problem.builders, pass_state)
+    chi2 = _chi2_per_dof(solved, keyframes, seen, tracks)
+    # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
+    together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
+    told = [one.refused for one in (seen, tracks) if one is not None and one.refused]
+    warnings = [*problem.warnings, *told, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
+    summary: dict[str, Any] = {
+        "mode": "batch" if absolute else "dead-reckoning",
+        "vehicle": problem.vehicle,
+        "session": {
+            "device": problem.session.device.name,
+            "clock_epoch": problem.session.clock_epoch,
+            "t0_ns": t0,
+            "forward": problem.session.device.forward,
+            "up": problem.session.device.up,
+            "gravity_m_s2": problem.session.gravity,
+        },
+        "duration_s": duration,
+        "path_m": keyframes.path_length(),
+        "keyframes": len(keyframes),
+        "factors": factors,
+        "chi2_per_dof": chi2,
+        "iterations": estimate.iterations,
+        "converged": estimate.converged,
+        "cost": estimate.cost,
+        "states": _states(solved),
+        "timings_s": {name: round(value, 4) for name, value in timings.items()},
+        "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "gaps": [
+            {"start_s": round((gap.start_ns - t0) / 1e9, 3), "length_s": round(gap.length_s, 3), "kind": gap.kind}
+            for gap in problem.gaps
+        ],
+        "standstills": _standstills(problem),
+        "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
+        "used": dict(used_counts(problem, pass_state)),
+        "rejected": _rejected(pass_state, seen, tracks),
+        **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
+        **({} if tracks is None else {"tracks": dict(tracks.tracks)}),
+        "rejections": rejections(solved),
+        "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
+        "position_sigma_m": _sigma_summary(keyframes),
+        "initialisation": initial.to_dict(),
+        "warnings": warnings,
+        "versions": versions(),
+    }
+    return summary | dict(extra)
+
+
+def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outliers.Account | None) -> dict[str, int]:
+    """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the way, and matches and
+    observations of those that do not."""
+    found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("coplanarity", "matches")}
+    if seen is not None:
+        found |= {"coplanarity": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
+    if tracks is not None and tracks.in_force:
+        found |= {SMART: tracks.contrary, "tracks": tracks.outliers}
+    return found
+
+
+def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
+    """The states of the session, and the noise found on the way."""
+    problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
+    found: dict[str, dict[str, Any]] = {}
+    for state in estimate.session.values():
+        sigma = state.prior_sigma if state.held else state.sigma
+        value, spread = ([round(float(x), 6) for x in numbers] for numbers in (state.value, sigma))
+        alone = len(value) == 1
+        found[state.name] = {
+            "value": value[0] if alone else value,
+            "sigma": spread[0] if alone else spread,
+            "held": state.held,
+        }
+        if not alone and not state.held:
+            found[state.name]["observed"] = (state.sigma < OBSERVED * state.prior_sigma).tolist()
+    found |= _inertial_noise(problem, pass_state) | _row_noise(problem, pass_state)
+    for builder in position_builders(problem.builders):
+        if builder.name in pass_state.correlated:
+            found[f"{builder.name}_wander_sigma_m"] = {
+                "value": [float(s) for s in wander_sigma(builder.noise)],
+                "sigma": None,
+                "held": True,
+            }
+        if builder.name in pass_state.noise_scales:
+            sigma = builder.scaled_sigma(pass_state)[~builder.own_sigma]
+            found[f"{builder.name}_sigma_m"] = {
+                "value": [round(float(s), 4) for s in sigma[0]],
+                "sigma": None,
+                "held": False,
+            }
+    return found
+
+
+def _inertial_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
+    """Noise densities and bias walks used; held where the data said too little of them."""
+    noise = problem.calibration.imu_noise
+    if not problem.config.imu.estimate_noise:
+        return {}
+    return {
+        name: {
+            "value": float(f"{getattr(noise, name) * pass_state.scale(group):.4g}"),
+            "sigma": None,
+            "held": group not in pass_state.noise_scales,
+        }
+        for group, name in NOISE_NAMES.items()
+    }
+
+
+def _row_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
+    """Sigmas of the constraints' rows."""
+    groups = [item for builder in problem.builders for item in noise_groups(builder).items()]
+    return {
+        f"{group}_sigma": {
+            "value": float(f"{sigma * pass_state.scale(group):.4g}"),
+            "sigma": None,
+            "held": group not in pass_state.noise_scales,
+        }
+        for group, sigma in groups
+    }
+
+
+def _standstills(problem: Problem) -> dict[str, Any]:
+    """How often and how long the device stood still in the stretch that was solved; how much of it truly at rest."""
+    rests = problem.rests
+    if rests is None:
+        return {}
+    first, last = problem.windows[0].t1_ns, problem.windows[-1].t1_ns
+    found = {"total_s": rests.spans(), "at_rest_s": rests.rests()}
+    inside = {
+        name: [(max(a, first), min(b, last)) for a, b in spans if b > first and a < last]
+        for name, spans in found.items()
+    }
+    seconds = {name: round(sum(b - a for a, b in spans) / 1e9, 3) for name, spans in inside.items()}
+    t0 = problem.session.t0_ns
+    spans = [[round((a - t0) / 1e9, 3), round((b - t0) / 1e9, 3)] for a, b in inside["total_s"]]
+    return {"count": len(spans), **seconds, "on_foot": rests.on_foot, "spans_s": spans}
+
+
+def _sigma_summary(solution: Solution) -> dict[str, float]:
+    """Horizontal one-sigma: median, 95 % and largest, metres."""
+    horizontal = np.hypot(*solution.sigmas[:, POS][:, :2].T)
+    return {
+        "median": float(np.median(horizontal)),
+        "p95": float(np.percentile(horizontal, 95)),
+        "max": float(horizontal.max()),
+    }

@@ -1,0 +1,166 @@
+"""Which image pairs, and which of their matches, an estimate believes: pass by pass until they are settled.
+
+First by the turn that inertial data tell (two matches give the baseline); then at the smoothed states; then once more,
+whereupon pairs are compressed. Where too few pairs agree with the solution without images, that is too poor to judge
+them, and none is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Mask
+from smartnav_graph.factors.camera import BORESIGHT, STREAM, Motion
+from smartnav_graph.factors.coplanar_rows import COLUMNS, Relative, relative
+from smartnav_graph.factors.coplanarity import (
+    COMPRESSED,
+    CONTRARY,
+    IN_USE,
+    OUTSIDE,
+    POSE_DOF,
+    REASONS,
+    CoplanarityBuilder,
+)
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.update import Builder, one_of
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.vision.epipolar import sampson
+from smartnav_graph.vision.gating import Geometry
+
+# A match within so many sigmas of the smoothed states is one.
+GATE = 4.0
+# Share of the pairs with a baseline that must be kept for any to be used.
+LEAST_PAIRS = 0.5
+# A pair is astray when its second image is less sure than this share of the baseline; pairs that may be.
+LARGEST_STRAY, FEW_ASTRAY = 0.3, 0.1
+# Sigma of a match beside that of its class: least and most.
+SCALES = (0.3, 3.0)
+
+
+def settled(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+    """The memory with the matches that agree with an estimate; unchanged once they are settled."""
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None or pass_state.settled.get(builder.name, 0) >= COMPRESSED:
+        return pass_state
+    return _judged(builder, estimate, pass_state)
+
+
+def _judged(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
+    passed, scale = pass_state.settled.get(builder.name, 0), pass_state.scale(builder.name)
+    place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
+    R, _, v, bias = (x[place] for x in estimate.states())
+    builder.look(estimate.offset_s(STREAM), Motion(R, v, bias[:, 3:]))
+    there, inside = relative_poses(builder, estimate)
+    if passed == 0:
+        use, verdict = builder.by_turn(builder.pairs, there.R)
+    else:
+        use, verdict, scale = _by_states(builder, there, scale)
+    verdict = np.where(inside, verdict, OUTSIDE)
+    builder.refused = _refusal(verdict)
+    builder.verdict = np.where(verdict == IN_USE, CONTRARY, verdict) if builder.refused else verdict
+    builder.frozen = there
+    used = np.asarray(builder.pairs.flat(use & (builder.verdict == IN_USE)[:, None]))
+    rejected = {
+        "matches": frozenset(np.flatnonzero(~used).tolist()),
+        builder.name: frozenset(np.flatnonzero(builder.verdict != IN_USE).tolist()),
+    }
+    return replace(
+        pass_state,
+        rejected={**pass_state.rejected, **rejected},
+        noise_scales={**pass_state.noise_scales, builder.name: scale},
+        settled={**pass_state.settled, builder.name: COMPRESSED if builder.refused else passed + 1},
+    )
+
+
+def lost(builders: Iterable[Builder], estimate: Estimate) -> bool:
+    """Whether the way between images is so poorly known that what they say of it may be far: a redescending loss does
+    not find the way back, and a baseline fits as well the other way round."""
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None:
+        return False
+    there, inside = relative_poses(builder, estimate)
+    sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
+    place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
+    strays = sigma[place][builder.pairs.images[:, 1]] * builder.pairs.length_s
+    diverged = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
+    used = inside & (builder.verdict == IN_USE)
+    return bool(used.any() and diverged[used].mean() > FEW_ASTRAY)
+
+
+def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tuple[Mask, NDArray[np.intp], float]:
+    """Matches (padded) that agree with the smoothed states, the verdict on each pair, and the scale of a match's
+    sigma: that of their median, the freedom of each pair's pose taken out."""
+    pairs = builder.pairs
+    x0, x1, shift = pairs.matches
+    white = np.abs(sampson(there.R, there.t, x0, x1, shift=shift).residual) / builder.sigma
+    geometry = Geometry.of(pairs, there.R)
+    use = (white < GATE * scale) & pairs.there
+    use &= geometry.plausible(there.t, np.full(len(pairs), builder.sigma * scale), use)
+    verdict = builder.judged(pairs, use, geometry.parallax())
+    good = use & (verdict == IN_USE)[:, None]
+    left = int(good.sum()) - POSE_DOF * int((verdict == IN_USE).sum())
+    if left > POSE_DOF:
+        spread = 1.4826 * float(np.median(white[good])) * np.sqrt(good.sum() / left)
+        scale = float(np.clip(spread, *SCALES))
+    return use, verdict, scale
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the pairs (by reason, `REASONS`) and of the matches of those in use."""
+
+    pairs: Mapping[str, int]
+    matches: int
+    outliers: int
+    refused: str
+
+    @property
+    def redundancy(self) -> int:
+        """Matches in use beyond what the poses of their pairs take."""
+        return self.matches - self.outliers - POSE_DOF * self.pairs[REASONS[IN_USE]]
+
+
+def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
+    """The account of the image pairs of a run; None where there are none, or others stand in for them."""
+    builder = one_of(builders, CoplanarityBuilder)
+    if builder is None or builder.replaced(pass_state):
+        return None
+    verdict = builder.verdict_of(pass_state)
+    count = np.bincount(verdict, minlength=len(REASONS))
+    inside = verdict[builder.pairs.pair] == IN_USE
+    use = builder.used_matches(pass_state)
+    refused = builder.refused if pass_state.settled else ""
+    told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+    return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
+
+
+def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
+    """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
+    place, known = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
+    R, p, v, _ = (x[place] for x in estimate.states())
+    pose = np.tile(np.eye(4), (len(place), 1, 1))
+    pose[:, :3, :3], pose[:, :3, 3] = R, p
+    first, second = builder.pairs.images.T
+    data = np.zeros((len(first), COLUMNS))
+    data[:, 1:4], data[:, 4:7] = builder.rate[first], builder.rate[second]
+    states = [pose[first], pose[second]]
+    if builder.rig.timed:
+        states += [v[first], v[second], np.full((len(first), 1), estimate.offset_s(STREAM))]
+    if builder.rig.boresight:
+        states.append(np.tile(estimate.session_value(BORESIGHT, 3), (len(first), 1)))
+    return relative(builder.rig, states, data), known[first] & known[second]
+
+
+def _refusal(verdict: NDArray[np.intp]) -> str:
+    """Why no pair is to be used; empty where they are."""
+    kept, asked = int((verdict == IN_USE).sum()), int(np.isin(verdict, [IN_USE, CONTRARY]).sum())
+    if kept >= LEAST_PAIRS * asked:
+        return ""
+    return (
+        f"coplanarity: refused, only {kept} of {asked} image pairs agree with the solution without images: too "
+        "poor to judge them by; add fixes, control points or standstills"
+    )

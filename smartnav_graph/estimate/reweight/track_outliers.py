@@ -1,0 +1,191 @@
+"""Which tracks, and which of their observations, an estimate believes.
+
+Points are found at its states, and what disagrees with most of a track is left out: once at the solution that image
+pairs (or inertial data and fixes alone) gave, once more at that with tracks. Where too few tracks agree, none is used,
+and the pairs stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.factors.camera import BORESIGHT, STREAM
+from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
+from smartnav_graph.factors.smart import CONTRARY, FEW, FLAT, IN_USE, LEAST_SEEN, OUTSIDE, REASONS, SmartBuilder
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.update import Builder, one_of
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.vision.points import Cameras, Points, meet
+
+# Passes that judge tracks.
+ROUNDS = 2
+# Share of its observations that a track must keep, and of tracks that must be kept for any to be used.
+LEAST_SHARE = 0.5
+# What a point takes of its observations.
+POINT_DOF = 3
+# Sigma of an observation beside that of its class: least and most.
+SCALES = (0.3, 3.0)
+
+
+def chosen(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+    """The memory with the tracks that agree with an estimate; unchanged while pairs are not settled, and once tracks
+    are."""
+    found = one_of(builders, SmartBuilder)
+    if found is None or found.refused or pass_state.settled.get(found.name, 0) >= ROUNDS:
+        return pass_state
+    pairs = one_of(builders, CoplanarityBuilder)
+    if pairs is not None and pass_state.settled.get(pairs.name, 0) < COMPRESSED:
+        return pass_state
+    if pairs is not None and pairs.refused:
+        found.refused = "smart: tracks are refused as the image pairs are"
+        return pass_state
+    return _judged(found, estimate, pass_state)
+
+
+def _judged(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
+    passed, seen = pass_state.settled.get(builder.name, 0), builder.sightings
+    if not passed:
+        builder.boresight = estimate.session_value(BORESIGHT, 3)
+    views = _views(builder, estimate)
+    use = seen.there & views.known
+    points = meet(seen, views.then, builder.sigma * pass_state.scale(builder.name), use)
+    builder.use, builder.verdict = points.inside, _verdict(builder, use, points)
+    builder.xy = seen.xy + views.keyframe.project(points.point) - views.then.project(points.point)
+    builder.refused = _refusal(builder.verdict)
+    if builder.refused:
+        return _without(builder, pass_state)
+    states = [estimate.session[s.name] for s in builder.camera_model.states().values() if s.name in estimate.session]
+    return replace(
+        pass_state,
+        held={**pass_state.held, **{state.name: state.value for state in states}},
+        noise_scales={**pass_state.noise_scales, builder.name: _scale(builder, points)},
+        settled={**pass_state.settled, builder.name: passed + 1},
+    )
+
+
+def _without(builder: SmartBuilder, pass_state: PassState) -> PassState:
+    """The memory with image pairs in force again, and the camera's states free."""
+    names = {state.name for state in builder.camera_model.states().values()}
+    return replace(
+        pass_state,
+        held={name: value for name, value in pass_state.held.items() if name not in names},
+        settled={name: count for name, count in pass_state.settled.items() if name != builder.name},
+    )
+
+
+class _Views(NamedTuple):
+    """Cameras at the keyframes of all observations, the same when these were made, and which have a keyframe (n, l)."""
+
+    keyframe: Cameras
+    then: Cameras
+    known: Mask
+
+
+def _views(builder: SmartBuilder, estimate: Estimate) -> _Views:
+    seen, stamps = builder.sightings, builder.image_ns
+    place, known = estimate.keyframes_at(stamps, builder.merge_ns)
+    known[1:] &= place[1:] != place[:-1]  # a keyframe stands for one image
+    R, p, v, bias = (x[place][seen.image.ravel()] for x in estimate.states())
+    delay = estimate.offset_s(STREAM) + builder.camera_model.delay(seen.xy.reshape(-1, 2))
+    turn = builder.rates.turn(stamps[seen.image.ravel()], delay) - bias[:, 3:] * delay[:, None]
+    later, on = R @ exp(turn), p + v * delay[:, None]
+    at_once, then = (_camera(builder, *pose) for pose in ((R, p), (later, on)))
+    return _Views(at_once, then, known[seen.image])
+
+
+def _camera(builder: SmartBuilder, R: Floats, p: Floats) -> Cameras:
+    """Cameras of bodies at R (n l, 3, 3), p (n l, 3)."""
+    shape = builder.sightings.image.shape
+    place = p + R @ builder.camera_model.rig.body_t_cam
+    return Cameras((R @ builder.body_R_cam).reshape(*shape, 3, 3), place.reshape(*shape, 3))
+
+
+def _verdict(builder: SmartBuilder, use: Mask, points: Points) -> NDArray[np.intp]:
+    """What becomes of each track (n,), of its observations in the stretch (n, l)."""
+    asked, kept = use.sum(axis=1), points.inside.sum(axis=1)
+    cases = {
+        OUTSIDE: (asked < LEAST_SEEN) & (builder.sightings.count >= LEAST_SEEN),
+        CONTRARY: (asked >= LEAST_SEEN) & (kept < LEAST_SHARE * asked),
+        FEW: kept < LEAST_SEEN,
+        FLAT: points.parallax < builder.config.least_parallax,
+    }
+    return np.select(list(cases.values()), list(cases), IN_USE).astype(np.intp)
+
+
+def _refusal(verdict: NDArray[np.intp]) -> str:
+    """Why no track is to be used; empty where they are."""
+    kept, asked = int((verdict == IN_USE).sum()), int(np.isin(verdict, [IN_USE, CONTRARY]).sum())
+    if kept >= LEAST_SHARE * asked and kept:
+        return ""
+    return (
+        f"smart: refused, only {kept} of {asked} tracks agree with the solution without them: too poor to judge them "
+        "by; leave coplanarity on, or add fixes, control points or standstills"
+    )
+
+
+def _scale(builder: SmartBuilder, points: Points) -> float:
+    """Scale of the sigma of an observation: the root mean square of those in use, what the points take put back."""
+    tracks = builder.verdict == IN_USE
+    square = (points.residual[points.inside & tracks[:, None]] ** 2).sum() / builder.sigma**2
+    left = 2 * int(points.inside[tracks].sum()) - POINT_DOF * int(tracks.sum())
+    return float(np.clip(np.sqrt(square / left), *SCALES))
+
+
+def whitened(
+    builders: Iterable[Builder], estimate: Estimate, pass_state: PassState
+) -> tuple[NDArray[np.int64], Floats, Mask] | None:
+    """Keyframe stamps (m,), whitened residuals (m, 2) and whether in use (m,), of the observations of the tracks in
+    use; None where tracks are not in force."""
+    builder = one_of(builders, SmartBuilder)
+    if builder is None or not builder.in_force(pass_state):
+        return None
+    seen = builder.sightings
+    sigma = builder.sigma * pass_state.scale(builder.name)
+    points = meet(seen, _views(builder, estimate).then, sigma, builder.use)
+    told = seen.there & (builder.verdict == IN_USE)[:, None]
+    return builder.image_ns[seen.image[told]], points.residual[told] / sigma, builder.use[told]
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the tracks (by reason, `REASONS`) and of the observations of those in use."""
+
+    tracks: Mapping[str, int]
+    observations: int
+    outliers: int
+    refused: str
+    in_force: bool
+
+    @property
+    def contrary(self) -> int:
+        """Tracks that contradict the way."""
+        return self.tracks[REASONS[CONTRARY]]
+
+    @property
+    def points(self) -> int:
+        """Tracks in use."""
+        return self.tracks[REASONS[IN_USE]]
+
+    @property
+    def redundancy(self) -> int:
+        """Coordinates in use beyond what the points take."""
+        return 2 * (self.observations - self.outliers) - POINT_DOF * self.points
+
+
+def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
+    """The account of the tracks of a run; None where they are not asked for."""
+    builder = one_of(builders, SmartBuilder)
+    if builder is None:
+        return None
+    count = np.bincount(builder.verdict, minlength=len(REASONS))
+    told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+    inside = builder.sightings.there & (builder.verdict == IN_USE)[:, None]
+    wrong = int((inside & ~builder.use).sum())
+    return Account(told, int(inside.sum()), wrong, builder.refused, builder.in_force(pass_state))

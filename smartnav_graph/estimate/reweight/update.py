@@ -1,0 +1,214 @@
+"""What one pass teaches the next: which fixes to reject, and how noisy the sensors are.
+
+Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
+and rows inside the gate are let in again. A redescending loss does not see what lies far beyond its sigma, and the way
+to a fix of centimetres is foretold to metres: so the loss is as wide as that first, and narrowed pass by pass. Where
+asked for, truncated least squares by graduated non-convexity stands
+between the two, warm-started by the first. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
+with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6). What needs the
+trajectory found first (time offsets, vehicle constraints, wandering errors) joins when nothing is left to learn
+without it; session states that the data do not determine are held at their calibrated value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from smartnav_graph.estimate.reweight.constraint_noise import row_scales
+from smartnav_graph.estimate.reweight.image_pair_outliers import settled
+from smartnav_graph.estimate.reweight.imu_noise import noise_scales
+from smartnav_graph.estimate.reweight.outliers import (
+    FixResiduals,
+    Verdict,
+    _position_verdict,
+    fix_residuals,
+    position_builders,
+    verdicts,
+)
+from smartnav_graph.estimate.reweight.track_outliers import ROUNDS, chosen
+from smartnav_graph.factors.gnss import PositionBuilder
+from smartnav_graph.factors.smart import SmartBuilder
+from smartnav_graph.factors.vehicle import VehicleBuilder
+from smartnav_graph.graph import gnc
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.update import Builder, one_of
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.smoothers.estimate import Estimate
+
+# No fix is believed better than this, metres: clocks and lever arms are not.
+LEAST_SIGMA = 0.03
+LEAST_REDUNDANCY = 10.0
+# Outliers are looked for when the worst fix of all would be so rare among good ones.
+SURPRISE = 0.01
+# Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
+# rest on few degrees of freedom and creep.
+STEADY = 0.1
+STEADY_INERTIAL = 0.1
+
+
+# Growth of the control a pass from a warm start, and the most passes that takes.
+GROWTH = 4.0
+GRADUATED_PASSES = 14
+
+# Sigma (m) of fixes under a redescending loss: as far as a stretch between fixes is foretold, and as far as outliers
+# bend least squares; and the share of it that the next pass has.
+WIDE_M, BENT_M = 3.0, 30.0
+NARROWER = 0.1
+
+# A session state is held where the data leave more than this of its prior sigma.
+OBSERVED = 0.7
+
+
+def update_pass_state(
+    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, pass_state: PassState
+) -> tuple[PassState, bool]:
+    """The memory for the next pass, and whether there is nothing more to learn."""
+    new, done = _revised(builders, windows, estimate, pass_state)
+    if new.stage < LAST_STAGE:
+        return new, done
+    judged = settled(builders, estimate, new)
+    judged = chosen(builders, estimate, judged) if judged is new else judged
+    return judged, done and judged is new
+
+
+def _revised(
+    builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, pass_state: PassState
+) -> tuple[PassState, bool]:
+    """The same by fixes and inertial data alone."""
+    found = {b.name: (b, fix_residuals(b, windows, estimate, pass_state)) for b in position_builders(builders)}
+    found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
+    new = pass_state
+    for builder, residuals in found.values():
+        new = _rescaled(builder, residuals, new)
+    judged = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
+    if pass_state.phase == "plain" and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
+        return replace(new, phase="robust"), False
+    if pass_state.narrowing:
+        return replace(new, control=_shrink_robust_scale(found, pass_state.control)), False
+    outliers = {v.name: v.outside() for v in judged}
+    if pass_state.phase in ("robust", "graduated"):
+        weighed = _graduated(judged, pass_state)
+        if weighed is not None:
+            return replace(weighed, noise_scales=new.noise_scales), False
+        return replace(new, phase="gated", rejected=outliers, weights={}), False
+    if pass_state.phase == "gated":
+        new = replace(new, rejected=outliers)
+    steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in found)
+    tuned, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
+    if pass_state.stage == LAST_STAGE:
+        new, steady = tuned, steady and calm
+    if not (steady and new.rejected == pass_state.rejected):
+        return new, False
+    grown = enable_second_stage(builders, estimate, tuned)
+    return grown, grown == tuned
+
+
+def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float = WIDE_M) -> PassState:
+    """The memory of a robust pass from a start that is off by so many metres."""
+    sigmas = [float(np.median(b.scaled_sigma(pass_state)[:, :2])) for b in position_builders(builders) if b.gated]
+    return replace(pass_state, control=metres if min(sigmas, default=metres) < metres / 3 else 0.0)
+
+
+def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], control: float) -> float:
+    """The next least sigma (m) of fixes under the loss: a share of this one, less where most fixes agree better, none
+    once it would be below what is known of them."""
+    known = [(float(np.median(one.sigma[:, :2])), float(np.median(one.square))) for _, one in found.values()]
+    level = chi2(3).median()
+    wanted = min(NARROWER * control, 2.0 * max(sigma * np.sqrt(max(square / level, 1.0)) for sigma, square in known))
+    return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
+
+
+def _graduated(judged: Sequence[Verdict], pass_state: PassState) -> PassState | None:
+    """The memory with the weights of the next control; None where every weight is settled, or none is asked for."""
+    asked = [v for v in judged if v.graduated]
+    if not asked:
+        return None
+    squares = {v.name: v.relative() for v in asked}
+    if pass_state.phase == "robust":
+        control = min(gnc.first_control(square, 1.0) for square in squares.values())
+    else:
+        control = GROWTH * pass_state.control
+    found = {name: gnc.weights(square, 1.0, control) for name, square in squares.items()}
+    if all(gnc.settled(weight) for weight in found.values()):
+        return None
+    weights = {v.name: dict(zip(v.rows.tolist(), found[v.name].tolist(), strict=True)) for v in asked}
+    rejected = {v.name: v.outside() for v in judged if not v.graduated}
+    return replace(pass_state, phase="graduated", rejected=rejected, weights=weights, control=control)
+
+
+def extra_passes(builders: Iterable[Builder]) -> int:
+    """Passes that a graduated loss, and tracks that follow on image pairs, need beyond those of the others."""
+    builders = list(builders)
+    graduated_too = any(b.config.loss == "gnc" for b in position_builders(builders))
+    return GRADUATED_PASSES * graduated_too + ROUNDS * (one_of(builders, SmartBuilder) is not None)
+
+
+def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+    """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
+    positions = position_builders(builders)
+    wandering = frozenset(b.name for b in positions if b.wanders(pass_state))
+    if pass_state.stage < LAST_STAGE:
+        later = any(b.stage == LAST_STAGE or (hasattr(b, "grows") and b.grows(pass_state)) for b in builders)
+        return replace(pass_state, stage=LAST_STAGE, correlated=wandering) if later else pass_state
+    blind = {
+        state.name: state.prior_mean
+        for state in estimate.session.values()
+        if not state.held and (state.sigma > OBSERVED * state.prior_sigma).all()
+    }
+    return replace(pass_state, held={**pass_state.held, **blind}, correlated=wandering)
+
+
+def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
+    """Normalised square of the fixes in use over their redundancy, at least 1."""
+    square = redundancy = 0.0
+    for name, (_, one) in found.items():
+        used = pass_state.used(name, one.rows)
+        square += float(one.square[used].sum())
+        redundancy += float(one.redundancy[used].sum())
+    return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
+
+
+def _inertial(
+    builders: Sequence[Builder],
+    windows: Sequence[Window],
+    estimate: Estimate,
+    pass_state: PassState,
+    new: PassState,
+    level: float,
+) -> tuple[PassState, bool]:
+    """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
+    residuals hold more than noise: what they say is an upper bound. Beside fixes that wander it is a lower one: the
+    solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part.
+    Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
+    scales = noise_scales(builders, windows, estimate, pass_state, level)
+    if any(builder.wanders(pass_state) for builder in position_builders(builders)):
+        scales = {name: max(scale, 1.0) for name, scale in scales.items()}
+    if pass_state.settled or one_of(builders, VehicleBuilder) is not None:
+        scales = {name: max(scale, pass_state.scale(name)) for name, scale in scales.items()}
+    if pass_state.stage < LAST_STAGE:
+        scales = {name: min(scale, pass_state.scale(name)) for name, scale in scales.items()}
+        return replace(new, noise_scales={**new.noise_scales, **scales}), True
+    scales |= row_scales(builders, estimate, pass_state)
+    change = [abs(np.log(scale / pass_state.scale(name))) for name, scale in scales.items()]
+    return replace(new, noise_scales={**new.noise_scales, **scales}), max(change, default=0.0) < STEADY_INERTIAL
+
+
+def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassState) -> PassState:
+    """Variance component of the rows without a sigma of their own; rows outside the gate do not count."""
+    if builder.name in pass_state.correlated:
+        return pass_state
+    outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
+        builder.name, frozenset()
+    )
+    used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
+    redundancy = float(found.redundancy[used].sum())
+    if not builder.config.estimate_sigma or redundancy < LEAST_REDUNDANCY:
+        return pass_state
+    step = float(np.clip(np.sqrt(found.square[used].sum() / redundancy), 0.2, 5.0))
+    least = LEAST_SIGMA / float(builder.sigma[found.rows[used]].min())
+    scale = max(pass_state.scale(builder.name) * step, least)
+    return replace(pass_state, noise_scales={**pass_state.noise_scales, builder.name: scale})

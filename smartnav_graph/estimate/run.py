@@ -1,0 +1,131 @@
+"""Batch smoothing of a session from end to end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from smartnav_graph.core.errors import SolverError
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.estimate.alignment.initial_state import InitialState, UserStart
+from smartnav_graph.estimate.alignment.inputs import initialiser_of
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.passes import Clock, _forget, _window_by_window, solve_passes
+from smartnav_graph.estimate.problem import Problem, prepare
+from smartnav_graph.estimate.result.assemble import (
+    Withheld,
+    resample,
+    score,
+    to_solution,
+    used_counts,
+)
+from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
+from smartnav_graph.estimate.result.solved import SolvedProblem
+from smartnav_graph.estimate.result.summary import summarise
+from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.session import Session
+from smartnav_graph.smoothers.estimate import Estimate
+
+
+@dataclass(frozen=True)
+class Run:
+    """Everything one run gives. `summary` is what summary.json holds; `causal_windows` are those that a replay went
+    through, one a row of `causal`; `estimate` is the solved graph behind `solution`."""
+
+    problem: Problem
+    solution: Solution
+    summary: Mapping[str, Any]
+    causal: Solution | None = None
+    withheld: Mapping[str, Withheld] = field(default_factory=dict)
+    causal_windows: Sequence[Window] = ()
+    trace: Diagnostics | None = None
+    estimate: Estimate | None = None
+
+    @property
+    def session(self) -> Session:
+        return self.problem.session
+
+
+def initialise(problem: Problem, longest_s: float | None = None) -> InitialState:
+    """First state of a problem; `longest_s` bounds the stretch it may look at."""
+
+    def solve(
+        prior: PriorBuilder, count: int, pass_state: PassState, initial_values: Any = None
+    ) -> tuple[Estimate, PassState]:
+        estimate, pass_state, _ = solve_passes(
+            problem, problem.windows[:count], prior, pass_state, initial_values=initial_values, coarse_start=True
+        )
+        return estimate, pass_state
+
+    given = UserStart.parse(problem.config.run.initial) if problem.config.run.initial else None
+    return initialiser_of(problem, longest_s).run(solve, given)
+
+
+def smooth(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
+    """Batch smoothing of a recorded session.
+
+    Raises
+    ------
+    SessionError, ConfigError, SolverError
+        Bad input, or a problem that cannot be solved; the message says what to do.
+    """
+    clock = Clock()
+    progress("preparing", 0, 0)
+    problem = prepare(session, config or Config())
+    clock.lap("prepare")
+    progress("finding the start", 0, 0)
+    initial = initialise(problem)
+    initial_values, pass_state = initial.initial_values, initial.pass_state
+    if not problem.session.absolute():
+        builders = [initial.prior, *problem.builders]
+        initial_values, pass_state = _window_by_window(problem, problem.windows, builders, pass_state, progress)
+    _forget(problem.builders)
+    clock.lap("initialise")
+    estimate, pass_state, passes = solve_passes(
+        problem,
+        problem.windows,
+        initial.prior,
+        pass_state,
+        initial_values=initial_values,
+        first_s=initial.stretch_s,
+        progress=progress,
+        clock=clock,
+    )
+    clock.lap("build")
+    _refuse_empty(problem, pass_state)
+    return _finish(SolvedProblem(problem, estimate, pass_state), initial, clock, {"passes": passes})
+
+
+def _finish(
+    solved: SolvedProblem,
+    initial: InitialState,
+    clock: Clock,
+    extra: Mapping[str, Any],
+    causal: Solution | None = None,
+    updates: Updates | None = None,
+) -> Run:
+    problem, estimate = solved.problem, solved.estimate
+    keyframes = to_solution(solved)
+    withheld = score(problem, keyframes, estimate)
+    solution = resample(problem, keyframes)
+    clock.lap("assemble")
+    summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)
+    trace = Diagnostics.of(problem, estimate, solved.pass_state, updates)
+    return Run(problem, solution, summary, causal, withheld, trace=trace, estimate=estimate)
+
+
+def _refuse_empty(problem: Problem, pass_state: PassState) -> None:
+    """All fixes rejected is no solution."""
+    counts = used_counts(problem, pass_state)
+    if counts and not any(counts.values()):
+        rows = ", ".join(f"{name} {len(pass_state.rejected.get(name, ()))}" for name in counts)
+        raise SolverError(
+            "solve",
+            f"every absolute measurement was rejected ({rows})",
+            "measurements of the same motion as the inertial data",
+            "check clock and units with `smartnav info`, or use --gnss.loss huber",
+        )

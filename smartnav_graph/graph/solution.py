@@ -1,0 +1,192 @@
+"""What a smoother gives: states with covariance in nav axes, and residuals by sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.timebase import seconds_since
+
+ROT, POS, VEL, ACCEL_BIAS, GYRO_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
+COVARIANCE_NAMES = tuple(
+    f"{block}_{axis}"
+    for block, axes in (("rot", "enu"), ("pos", "enu"), ("vel", "enu"), ("accel_bias", "xyz"), ("gyro_bias", "xyz"))
+    for axis in axes
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    """One row a scalar residual: time, sensor name, axis, whitened residual, robust weight, whether it was used."""
+
+    t_ns: NDArray[np.int64]
+    sensor: NDArray[Any]
+    axis: NDArray[np.int64]
+    whitened: Floats
+    weight: Floats
+    used: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def of(self, sensor: str) -> NDArray[np.bool_]:
+        """Mask of the rows of one sensor."""
+        return np.asarray(self.sensor == sensor)
+
+    @classmethod
+    def empty(cls) -> Residuals:
+        none = np.zeros(0)
+        return cls(
+            t_ns=none.astype(np.int64),
+            sensor=none.astype(object),
+            axis=none.astype(np.int64),
+            whitened=none,
+            weight=none,
+            used=none.astype(bool),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """States at n epochs.
+
+    t_ns (n,) int64 on the IMU's clock; nav_R_body (n, 3, 3); nav_t_body (n, 3) m; nav_v_body (n, 3) m/s;
+    accel_bias (n, 3) m/s^2 and gyro_bias (n, 3) rad/s in body axes; covariance (n, 15, 15) in the order rotation,
+    position, velocity (nav axes), accelerometer bias, gyroscope bias (body axes). The rotation error is the nav-axes
+    vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame.
+    """
+
+    t_ns: NDArray[np.int64]
+    nav_R_body: Floats
+    nav_t_body: Floats
+    nav_v_body: Floats
+    accel_bias: Floats
+    gyro_bias: Floats
+    covariance: Floats
+    t0_ns: int
+    origin: Origin | None = None
+    forward: str = "+y"
+    up: str = "+z"
+    residuals: Residuals = field(default_factory=Residuals.empty)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def seconds(self) -> Floats:
+        """Seconds since the session's time zero, (n,)."""
+        return seconds_since(self.t_ns, self.t0_ns)
+
+    @property
+    def quat_wxyz(self) -> Floats:
+        """Unit quaternions (n, 4) w x y z of nav_R_body, w >= 0."""
+        return np.asarray(Rotation.from_matrix(self.nav_R_body).as_quat(canonical=True)[:, [3, 0, 1, 2]])
+
+    @property
+    def sigmas(self) -> Floats:
+        """One-sigma (n, 15) of every state."""
+        return np.sqrt(np.clip(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0, None))
+
+    @property
+    def heading_pitch_roll_deg(self) -> Floats:
+        """(n, 3) degrees; heading clockwise from north."""
+        return frames.heading_pitch_roll_deg(self.nav_R_body, self.forward, self.up)
+
+    @property
+    def sigma_heading_deg(self) -> Floats:
+        """(n,) degrees: rotation about the vertical."""
+        return np.degrees(self.sigmas[:, 2])
+
+    def path_length(self) -> float:
+        """Metres along the epochs."""
+        return float(np.linalg.norm(np.diff(self.nav_t_body, axis=0), axis=1).sum())
+
+    def trajectory_columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of trajectory.csv; lat, lon and height are NaN without an origin."""
+        if self.origin is None:
+            lla = np.full((len(self), 3), np.nan)
+        else:
+            lla = LocalFrame(self.origin).lla_from_nav(self.nav_t_body)
+        names = [
+            *("e_m", "n_m", "u_m", "lat_deg", "lon_deg", "height_m", "qw", "qx", "qy", "qz"),
+            *("ve_m_s", "vn_m_s", "vu_m_s", "heading_deg", "pitch_deg", "roll_deg"),
+            *("sigma_e_m", "sigma_n_m", "sigma_u_m", "sigma_heading_deg"),
+        ]
+        values = [
+            self.nav_t_body,
+            lla,
+            self.quat_wxyz,
+            self.nav_v_body,
+            self.heading_pitch_roll_deg,
+            self.sigmas[:, POS],
+            self.sigma_heading_deg[:, None],
+        ]
+        return {"t_ns": self.t_ns} | dict(zip(names, np.concatenate(values, axis=1).T, strict=True))
+
+    def all_columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of solution.parquet: trajectory, biases and the upper triangle of the covariance."""
+        columns = self.trajectory_columns()
+        for name, bias, unit in (("accel_bias", self.accel_bias, "m_s2"), ("gyro_bias", self.gyro_bias, "rad_s")):
+            columns |= {f"{name}_{axis}_{unit}": bias[:, i] for i, axis in enumerate("xyz")}
+        for i, row in enumerate(COVARIANCE_NAMES):
+            for j in range(i, 15):
+                columns[f"cov_{row}__{COVARIANCE_NAMES[j]}"] = self.covariance[:, i, j]
+        return columns
+
+    def to_pandas(self) -> Any:
+        """The trajectory with biases as a pandas DataFrame indexed by seconds since time zero."""
+        import pandas as pd
+
+        columns = {name: value for name, value in self.all_columns().items() if not name.startswith("cov_")}
+        return pd.DataFrame(columns, index=pd.Index(self.seconds, name="seconds"))
+
+
+def read(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Columns of a solution.parquet."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    return {name: table.column(name).to_numpy() for name in table.column_names}
+
+
+def from_columns(
+    columns: dict[str, NDArray[Any]],
+    *,
+    t0_ns: int,
+    origin: Origin | None,
+    forward: str = "+y",
+    up: str = "+z",
+    residuals: Residuals | None = None,
+) -> Solution:
+    """The inverse of `Solution.all_columns`."""
+
+    def stack(*names: str) -> Floats:
+        return np.stack([np.asarray(columns[name], dtype=np.float64) for name in names], axis=-1)
+
+    n = len(columns["t_ns"])
+    covariance = np.zeros((n, 15, 15))
+    for i, row in enumerate(COVARIANCE_NAMES):
+        for j in range(i, 15):
+            covariance[:, i, j] = covariance[:, j, i] = columns[f"cov_{row}__{COVARIANCE_NAMES[j]}"]
+    return Solution(
+        t_ns=np.asarray(columns["t_ns"], dtype=np.int64),
+        nav_R_body=Rotation.from_quat(stack("qx", "qy", "qz", "qw")).as_matrix(),
+        nav_t_body=stack("e_m", "n_m", "u_m"),
+        nav_v_body=stack("ve_m_s", "vn_m_s", "vu_m_s"),
+        accel_bias=stack(*(f"accel_bias_{a}_m_s2" for a in "xyz")),
+        gyro_bias=stack(*(f"gyro_bias_{a}_rad_s" for a in "xyz")),
+        covariance=covariance,
+        t0_ns=t0_ns,
+        origin=origin,
+        forward=forward,
+        up=up,
+        residuals=residuals or Residuals.empty(),
+    )

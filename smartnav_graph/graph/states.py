@@ -1,0 +1,131 @@
+"""The states of the graph: their kinds, keys and scopes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats
+
+
+@dataclass(frozen=True)
+class StateKind:
+    """One row of the state table.
+
+    scope : ``keyframe`` (one a keyframe), ``chain`` (one a keyframe, where its sensor has it), ``session`` (one)
+    trust (dim,) : step that a damping of one holds the state to
+    moved (dim,) : step that moves its linearisation point in replay
+    """
+
+    letter: str
+    name: str
+    dim: int
+    scope: str
+    damping_scale: Floats
+    relinearize_threshold: Floats
+
+
+def _kind(
+    letter: str, name: str, scope: str, damping_scale: Sequence[float], relinearize_threshold: Sequence[float]
+) -> StateKind:
+    return StateKind(letter, name, len(damping_scale), scope, np.array(damping_scale), np.array(relinearize_threshold))
+
+
+# Only rotations, biases and what multiplies them make the factors nonlinear.
+STATES: dict[str, StateKind] = {
+    kind.letter: kind
+    for kind in (
+        _kind("X", "pose", "keyframe", [0.3] * 3 + [100.0] * 3, [0.005] * 3 + [0.1] * 3),
+        _kind("V", "velocity", "keyframe", [10.0] * 3, [0.1] * 3),
+        _kind("B", "imu bias", "keyframe", [0.3] * 3 + [0.02] * 3, [0.01] * 3 + [0.001] * 3),
+        _kind("C", "gnss correlated error", "chain", [10.0] * 3, [1.0] * 3),
+        _kind("D", "barometer bias", "chain", [10.0], [1.0]),
+        _kind("G", "straying in a gap", "chain", [1.0] * 3 + [0.3] * 3, [0.03] * 3 + [0.01] * 3),
+        _kind("T", "time offset", "session", [0.3], [0.01]),
+        _kind("L", "lever arm", "session", [1.0] * 3, [0.05] * 3),
+        _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),
+        _kind("M", "vehicle mount", "session", [0.3] * 2 + [1.0] * 4 + [0.1] * 2, [0.01] * 2 + [0.1] * 4 + [1e-3] * 2),
+        _kind("W", "wheel scale and delay", "session", [0.1, 0.3], [0.005, 0.01]),
+        _kind("H", "hard iron", "session", [100.0] * 3, [1.0] * 3),
+        _kind("F", "magnetic field strength", "session", [30.0] * 2, [1.0] * 2),
+        _kind("U", "floor height", "session", [1.0], [0.1]),
+        _kind("K", "step factor", "session", [0.3] * 2, [0.02] * 2),
+        _kind("S", "inertial scale and misalignment", "session", [0.03] * 18, [0.003] * 18),
+    )
+}
+KEYFRAME_LETTERS = tuple(kind.letter for kind in STATES.values() if kind.scope == "keyframe")
+# A session state's index is its sensor's place here.
+SENSORS = (
+    *("imu", "gnss", "control", "pose_fixes", "velocity", "wheel", "vehicle", "magnetometer", "barometer", "steps"),
+    *("images", "tracks", "matches", "static"),
+)
+
+
+def kind_of(name: int) -> StateKind:
+    """Row of the state table behind a GTSAM key."""
+    return STATES[chr(gtsam.symbolChr(name))]
+
+
+# A GTSAM key holds its letter in the highest byte, its index below.
+_LETTER_AT = np.uint64(56)
+
+
+def letters_of(names: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Letter of each key, as its character's number."""
+    return (names >> _LETTER_AT).astype(np.uint8)
+
+
+def indices_of(names: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Index of each key."""
+    return (names & ((np.uint64(1) << _LETTER_AT) - np.uint64(1))).astype(np.int64)
+
+
+@lru_cache(maxsize=1 << 18)
+def key(letter: str, index: int) -> int:
+    """GTSAM key of a state."""
+    return int(gtsam.symbol(letter, index))
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """One state for the whole session, with its prior.
+
+    name : as in summary.json, with its unit (``gnss_time_offset_s``); initial (d,), sigma (d,) of the prior
+    """
+
+    letter: str
+    sensor: str
+    name: str
+    initial: Floats
+    sigma: Floats
+
+    @property
+    def key(self) -> int:
+        return key(self.letter, SENSORS.index(self.sensor))
+
+
+@dataclass(frozen=True)
+class State:
+    """Estimate at one keyframe: `nav` (gtsam.NavState) and `bias` (gtsam.imuBias.ConstantBias).
+
+    covariance : (15, 15) as in `Solution`, where a smoother knows it while it runs
+    """
+
+    index: int
+    t_ns: int
+    nav: Any
+    bias: Any
+    covariance: Floats | None = None
+
+    @classmethod
+    def of(cls, index: int, t_ns: int, nav: tuple[Floats, Floats, Floats], bias: Floats) -> State:
+        """Of nav_R_body (3, 3), nav_t_body (3,), nav_v_body (3,) and the biases (6,)."""
+        R, p, v = nav
+        pose = gtsam.Pose3(gtsam.Rot3(R), p)
+        return cls(index, t_ns, gtsam.NavState(pose, v), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))

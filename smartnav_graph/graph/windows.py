@@ -1,0 +1,46 @@
+"""The stretch between two keyframes, with its slice of every stream."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats
+
+
+@dataclass(frozen=True)
+class Window:
+    """The stretch (t0, t1] that ends at keyframe `index`, with its slice of every stream.
+
+    kind : ``first`` (t0 == t1, the first keyframe), ``normal``, ``gap`` (missing or bridged inertial data), ``static``
+    dt (m,) s, accel (m, 3) m/s^2, gyro (m, 3) rad/s : inertial intervals, means over each interval, borders
+    interpolated; the force is given in body axes at the interval's start
+    rows : row indices of each aiding stream at t1
+    late : rows that speak of an earlier time and became known in this window
+    """
+
+    index: int
+    t0_ns: int
+    t1_ns: int
+    kind: str
+    dt: Floats
+    accel: Floats
+    gyro: Floats
+    rows: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
+    late: Mapping[str, Sequence[DelayedRow]] = field(default_factory=dict)
+
+    @property
+    def length_s(self) -> float:
+        return (self.t1_ns - self.t0_ns) / 1e9
+
+
+@dataclass(frozen=True)
+class DelayedRow:
+    """A row of a stream that arrived after the window it speaks of: `t_ns` lies in `window`."""
+
+    row: int
+    t_ns: int
+    window: Window

@@ -1,0 +1,186 @@
+"""The trajectory on a plain map: equal axes, metres, what was used, what was rejected, how sure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import nearest
+from smartnav_graph.graph.solution import POS, Residuals, Solution
+from smartnav_graph.output.report.svg import Axis, Plot, legend, round_step, ticked
+from smartnav_graph.output.report.text import count, fixed
+from smartnav_graph.output.report.thin import thin_path
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Positioned
+
+FIXES = ("gnss", "control", "pose_fixes")
+SHAPES = (1.25, 2.4)  # width / height of the map
+ELLIPSES = 30
+
+
+def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
+    """Per position sensor: rows (n, 2) east, north and whether each was ``used``, ``rejected`` or ``unused``.
+
+    A fix belongs to the residual rows nearest in time, within a quarter of the sensor's median spacing.
+    Without residuals every fix inside the run counts as used.
+    """
+    found = {}
+    for name in FIXES:
+        stream = getattr(session, name)
+        if stream is None or not len(stream) or not len(solution):
+            continue
+        inside = (stream.t_ns >= solution.t_ns[0]) & (stream.t_ns <= solution.t_ns[-1])
+        if inside.any():
+            stream = stream.take(inside)
+            found[name] = session.nav_position(stream)[:, :2], _states(stream, name, solution.residuals)
+    return found
+
+
+def _states(stream: Positioned, name: str, residuals: Residuals) -> NDArray[np.str_]:
+    rows = residuals.of(name) if len(residuals) else np.zeros(0, dtype=bool)
+    if not rows.any():
+        return np.full(len(stream), "used" if not len(residuals) else "unused")
+    at, used = residuals.t_ns[rows], residuals.used[rows]
+    order = np.argsort(at, kind="stable")
+    at, used = at[order], used[order]
+    spacing = float(np.median(np.diff(stream.t_ns))) if len(stream) > 1 else 1e9
+    close = nearest(stream.t_ns, at)
+    known = np.abs(at[close] - stream.t_ns) <= max(spacing / 4, 1e6)
+    return np.where(~known, "unused", np.where(used[close], "used", "rejected"))
+
+
+def _axes(points: Floats) -> tuple[Axis, Axis, float]:
+    """Equal scales: east axis, north axis and width / height of the box."""
+    lo, hi = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(hi - lo, 1e-3 * max(float((hi - lo).max()), 1.0)) * 1.12
+    width, height = max(size[0], size[1] * SHAPES[0]), max(size[1], size[0] / SHAPES[1])
+    middle, half = (lo + hi) / 2, np.array([width, height]) / 2
+    (west, south), (east, north) = middle - half, middle + half
+    step = round_step(max(width, height), 9)
+    return ticked(west, east, step), ticked(south, north, step), float(width / height)
+
+
+def draw(
+    session: Session, solution: Solution, gaps: Sequence[tuple[float, float, str]], causal: Solution | None
+) -> str:
+    """The map as a figure with its legend."""
+    path = solution.nav_t_body[:, :2]
+    if len(solution) < 2 or not np.isfinite(path).all():
+        return "<p>The run has no path to draw.</p>"
+    fixes = fix_states(session, solution)
+    near = _near(path, fixes)
+    x, y, aspect = _axes(np.concatenate([path, near]))
+    plot = Plot(x, y, "Map of the trajectory, east and north in metres", "North [m]", "East [m]", aspect=aspect)
+    under = _ellipses(plot, solution) + _gaps(plot, solution, gaps)
+    entries = [("line way", "Smoothed path"), *_fixes(plot, fixes, ("used", "unused"))]
+    if causal is not None and len(causal) > 1:
+        _way(plot, causal.nav_t_body[:, :2], "line causal")
+        entries.append(("line causal", "Estimate while replaying (causal)"))
+    _way(plot, path, "line way")
+    entries += _fixes(plot, fixes, ("rejected",)) + under
+    _ends(plot, path)
+    _furniture(plot)
+    widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
+    return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
+
+
+def _near(path: Floats, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) -> Floats:
+    """Fixes that widen the map: none farther outside the path than a fifth of its size."""
+    lo, hi = path.min(axis=0), path.max(axis=0)
+    slack = 0.2 * float((hi - lo).max())
+    rows = np.concatenate([np.zeros((0, 2)), *(xy for xy, _ in fixes.values())])
+    return np.asarray(rows[((rows >= lo - slack) & (rows <= hi + slack)).all(axis=1)])
+
+
+def _way(plot: Plot, xy: Floats, cls: str) -> None:
+    keep = thin_path(xy, (plot.x.hi - plot.x.lo) / 4000)
+    plot.line(xy[keep, 0], xy[keep, 1], cls.removeprefix("line "), thin=False)
+
+
+def _fixes(
+    plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]], states: Sequence[str]
+) -> list[tuple[str, str]]:
+    names = {"gnss": "GNSS fix", "control": "Control point", "pose_fixes": "Pose fix"}
+    words = {"used": "used", "unused": "withheld or not used", "rejected": "rejected"}
+    entries = []
+    for name, (xy, state) in fixes.items():
+        for key in states:
+            rows = xy[state == key]
+            seen = (np.abs(plot.x.fraction(rows[:, 0]) - 0.5) <= 0.5) & (
+                np.abs(plot.y.fraction(rows[:, 1]) - 0.5) <= 0.5
+            )
+            if len(rows):
+                cls = f"{'control' if name != 'gnss' and key == 'used' else f'fix-{key}'}"
+                plot.dots(rows[seen, 0], rows[seen, 1], cls)
+                outside = f", {count((~seen).sum())} off the map" if (~seen).any() else ""
+                entries.append((f"dots {cls}", f"{names[name]} {words[key]} ({count(len(rows))}{outside})"))
+    return entries
+
+
+def _gaps(plot: Plot, solution: Solution, gaps: Sequence[tuple[float, float, str]]) -> list[tuple[str, str]]:
+    t, path = solution.seconds, solution.nav_t_body[:, :2]
+    for start, length, _ in gaps:
+        at = np.concatenate([[start], t[(t > start) & (t < start + length)], [start + length]])
+        plot.line(np.interp(at, t, path[:, 0]), np.interp(at, t, path[:, 1]), "hole", thin=False)
+    return [("line hole", f"IMU hole ({len(gaps)})")] if gaps else []
+
+
+def _ellipses(plot: Plot, solution: Solution) -> list[tuple[str, str]]:
+    """One-sigma ellipses at equal distances along the path, enlarged by a round factor where they are too small."""
+    chosen = _spaced(solution)
+    block = solution.covariance[:, POS, POS][chosen][:, :2, :2]
+    good = np.isfinite(block).all(axis=(1, 2))
+    chosen, block = chosen[good], block[good]
+    if not len(chosen):
+        return []
+    value, vector = np.linalg.eigh(block)
+    axes = np.sqrt(np.clip(value, 0.0, None))
+    wanted = 0.018 * (plot.x.hi - plot.x.lo)
+    typical = max(float(np.median(axes[:, 1])), float(axes[:, 1].max()) / 4)
+    scale = max(1.0, round_step(wanted / typical, 1)) if typical > 0 else 1.0
+    fits = scale * axes[:, 1] < (plot.x.hi - plot.x.lo) / 3
+    angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    for i, half, turn in zip(chosen[fits], axes[fits], vector[fits], strict=True):
+        ring = solution.nav_t_body[i, :2, None] + scale * (turn * half) @ circle
+        plot.area(ring[0], ring[1], "ellipse")
+    size = f"enlarged {fixed(scale, 0)}×" if scale > 1 else "true size"
+    wide = f"; {count((~fits).sum())} too large for this map" if not fits.all() else ""
+    return [("ellipse", f"1 sigma ellipse, {size}{wide}")]
+
+
+def _spaced(solution: Solution) -> NDArray[np.intp]:
+    step = np.linalg.norm(np.diff(solution.nav_t_body[:, :2], axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(step)])
+    if along[-1] <= 0:
+        return np.array([0])
+    return np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ELLIPSES)).clip(0, len(along) - 1))
+
+
+def _ends(plot: Plot, path: Floats) -> None:
+    a, b = path[0], path[-1]
+    where = [(float(plot.x.fraction(p[0])), 1 - float(plot.y.fraction(p[1]))) for p in (a, b)]
+    left = where[0][0] <= where[1][0]
+    for (fx, fy), p, word, on_left in ((where[0], a, "Start", left), (where[1], b, "End", not left)):
+        shape = f'cx="{100 * fx:.2f}%" cy="{100 * fy:.2f}%" r="5.5"'
+        plot.raw(f'<circle class="mark {word.lower()}" {shape}/>')
+        outward = on_left if 0.12 < fx < 0.88 else fx >= 0.88
+        plot.text(
+            p[0], p[1], word, f"note {'end' if outward else ''}", dx=-10 if outward else 10, dy=-8 if on_left else 16
+        )
+
+
+def _furniture(plot: Plot) -> None:
+    """Scale bar and north arrow, outside the frame: inside they would cover something on a small screen."""
+    width = plot.x.hi - plot.x.lo
+    length = round_step(width / 5, 1) / (1 if round_step(width / 5, 1) < width / 3.5 else 2)
+    share, text = 100 * length / width, f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
+    plot.raw(
+        f'<svg class="scale" x="0" y="100%"><rect x="0" y="31" width="{share:.2f}%" height="4"/>'
+        f'<text class="note" x="{share:.2f}%" dx="8" y="37">{text}</text></svg>'
+    )
+    plot.raw('<svg class="north" x="100%" y="0"><path d="M-7 -27l6 20l-6 -5l-6 5z"/>'
+             '<text class="note end" x="-20" y="-11">N</text></svg>')  # fmt: skip

@@ -1,0 +1,342 @@
+"""The window that opens: only views that have data, in the order in which a recording of its kind is looked at."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.graph.solution import Solution
+from smartnav_graph.output.rerun_log import colours, signals
+from smartnav_graph.output.rerun_log.cameras import CameraView
+from smartnav_graph.output.rerun_log.recorder import Recorder
+from smartnav_graph.output.rerun_log.spatial import Extent, nice
+from smartnav_graph.session.session import Session
+
+Names = tuple[tuple[str, str], ...]
+
+_MOTION: Names = (
+    ("Speed m/s", "/motion/speed"),
+    ("Heading, pitch, roll °", "/motion/attitude"),
+    ("Height m", "/motion/height"),
+)
+_SIGNALS: Names = (
+    ("Accelerometer m/s²", "/imu/accel"),
+    ("Gyroscope rad/s", "/imu/gyro"),
+    ("Magnetometer µT", "/magnetometer"),
+    ("Pressure hPa", "/barometer"),
+    ("Temperature °C", "/temperature"),
+    ("Velocity m/s (body)", "/velocity"),
+    ("Wheel speed m/s", "/wheel"),
+)
+_ACCURACY: Names = (
+    ("Position error m, bands 1σ 3σ", "/error/position"),
+    ("Rotation error °", "/error/rotation"),
+    ("Position σ m", "/sigma/position"),
+    ("Heading σ °", "/sigma/heading"),
+)
+_FOUND: Names = (
+    ("Accelerometer bias m/s², bands 1σ 3σ", "/bias/accel"),
+    ("Gyroscope bias rad/s, bands 1σ 3σ", "/bias/gyro"),
+)
+_UPDATES: Names = (
+    ("Updates: states (latency ms in latency.rrd)", "/update/effort"),
+    ("Correction of the past m", "/update/correction"),
+    ("Rejected rows by update", "/update/rejected"),
+)
+_PAIRS: Names = (("Matches of image pairs", "/pairs/matches"),)
+
+# The viewer's vertical opening angle, a picture 1.6 times as wide as high, and the share of it that is filled.
+OPENING_DEG, ASPECT, FILLED = 55.0, 1.6, 0.85
+# A scene too small for a map, m.
+SMALL = 50.0
+# How near the body is looked at, as a share of the scene.
+NEAR = 0.25
+
+
+def kind_of(recorder: Recorder, session: Session, solution: Solution | None) -> str:
+    """What a recording is looked at for: ``calibration`` (signals without a path), ``session`` (not solved yet),
+    ``vision``, ``car`` (under the sky) or ``indoor``."""
+    if solution is None:
+        return "calibration" if not recorder.has("/world") else "session"
+    if recorder.has("/pairs") or any("/image" in path for path in recorder.paths):
+        return "vision"
+    return "car" if session.gnss is not None else "indoor"
+
+
+# The signal that each kind shows first.
+_FIRST = {"car": "/motion/speed", "indoor": "/motion/height", "vision": "/motion/attitude"}
+
+
+def build(
+    recorder: Recorder,
+    session: Session,
+    solution: Solution | None,
+    extent: Extent | None,
+    factor: float,
+    seen: list[CameraView],
+) -> Any:
+    """Left the path with graph, report, map and cameras; right what is drawn against time. `factor` magnifies the
+    ellipsoids of the path."""
+    import rerun.blueprint as rrb
+
+    kind = kind_of(recorder, session, solution)
+    flat = _row(_flat_views(recorder, session, extent, seen))
+    left = _stack([_tabs(_scenes(recorder, solution, extent, factor)), flat], [1, 1] if kind == "vision" else [3, 2])
+    right = _right(recorder, solution, kind)
+    sides = [side for side in (left, right) if side is not None]
+    return rrb.Blueprint(
+        rrb.Horizontal(*sides, column_shares=[3, 2][: len(sides)]),
+        rrb.TimePanel(timeline="elapsed", state="collapsed", play_state="paused"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _stack(parts: list[Any], shares: list[float]) -> Any:
+    import rerun.blueprint as rrb
+
+    there = [(part, share) for part, share in zip(parts, shares, strict=True) if part is not None]
+    if len(there) < 2:
+        return there[0][0] if there else None
+    return rrb.Vertical(*(part for part, _ in there), row_shares=[share for _, share in there])
+
+
+def _tabs(views: list[Any]) -> Any:
+    import rerun.blueprint as rrb
+
+    if len(views) < 2:
+        return views[0] if views else None
+    return rrb.Tabs(*views, active_tab=0)
+
+
+def _row(views: list[Any]) -> Any:
+    import rerun.blueprint as rrb
+
+    if len(views) < 2:
+        return views[0] if views else None
+    return rrb.Horizontal(*views)
+
+
+def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None, factor: float) -> list[Any]:
+    import rerun.blueprint as rrb
+
+    views: list[Any] = []
+    if extent is not None and recorder.has("/world"):
+        name = "Path (ENU)"
+        if recorder.has("/world/est/covariances"):
+            name += f", 3σ ellipsoids ×{factor:g}"
+        views.append(world_view(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
+        if solution is not None and recorder.has("/world/est/body"):
+            views.append(_ride(solution, extent))
+    if recorder.has("/graph"):
+        (left, top), (right, bottom) = recorder.bounds["/graph"]
+        bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
+        views.append(rrb.GraphView(name="Factor graph", origin="/graph", visual_bounds=bounds))
+    documents = (("Report", "/report"), ("States of the session", "/states"), ("Legend", "/legend"))
+    views += [rrb.TextDocumentView(name=name, origin=path) for name, path in documents if recorder.has(path)]
+    return views
+
+
+def _ride(solution: Solution, extent: Extent) -> Any:
+    """The scene as it passes the body, from behind and above it: with camera, velocity and true uncertainty."""
+    import rerun.blueprint as rrb
+
+    ahead, _, up = frames.body_R_vehicle(solution.forward, solution.up).T
+    near = NEAR * extent.size
+    return rrb.Spatial3DView(
+        name="Behind the body",
+        origin="/world/est/body",
+        contents=["/world/**", "- /world/est/covariances"],
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(position=near * (0.5 * up - ahead), look_target=near * (0.5 * ahead), eye_up=up),
+    )
+
+
+def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
+    """The scene looked at along `direction` from where everything is in the picture."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial3DView(
+        name=name,
+        origin="/world",
+        contents=["/world/**"],
+        line_grid=rrb.LineGrid3D(
+            visible=True,
+            spacing=nice(extent.size / 10),
+            plane=rr.components.Plane3D.XY.with_distance(extent.floor),
+            color=colours.GRID,
+        ),
+        eye_controls=rrb.EyeControls3D(
+            position=eye_position(extent, direction, np.array(up)), look_target=extent.centre, eye_up=up
+        ),
+    )
+
+
+def eye_position(extent: Extent, direction: Floats, up: Floats) -> Floats:
+    """Nearest eye (3,) on the line through the centre along `direction` that has every point in the picture.
+
+    A point (x, y, z) right of, above and behind the centre is inside where |x| <= a (d + z) and |y| <= b (d + z), with
+    d the eye's distance and a, b the tangents of half the opening angles: d is the largest |x| / a - z, |y| / b - z.
+    """
+    ahead = direction / np.linalg.norm(direction)
+    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+    x, y, z = np.stack([right, np.cross(right, ahead), ahead]) @ (extent.points - extent.shift - extent.centre).T
+    half = np.tan(np.radians(0.5 * OPENING_DEG)) * FILLED
+    distance = max(float((np.abs(x) / (half * ASPECT) - z).max()), float((np.abs(y) / half - z).max()))
+    return np.asarray(extent.centre - ahead * max(distance, 0.5 * extent.size))
+
+
+def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, seen: list[CameraView]) -> list[Any]:
+    views: list[Any] = []
+    if recorder.has("/geo") and extent is not None and extent.size > SMALL:
+        views.append(_map(session, extent))
+    elif recorder.has("/world") and extent is not None:
+        views.append(world_view("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
+    for view in seen:
+        if recorder.has(view.image) or (view.camera is not None and recorder.has(view.points)):
+            views.append(_camera(view))
+        if view.camera is None and recorder.has(view.origin):
+            views.append(_normalised(view, session))
+    return views
+
+
+def _camera(view: CameraView) -> Any:
+    """The image of one camera, in pixels."""
+    import rerun.blueprint as rrb
+
+    bounds = None
+    if view.camera is not None:
+        bounds = rrb.VisualBounds2D(x_range=[0, view.camera.width], y_range=[0, view.camera.height])
+    contents = [f"{view.root}/**"]
+    return rrb.Spatial2DView(name=f"Camera {view.name}", origin=view.root, contents=contents, visual_bounds=bounds)
+
+
+def _normalised(view: CameraView, session: Session) -> Any:
+    """Points of a camera without calibration, in normalised image coordinates."""
+    import rerun.blueprint as rrb
+
+    points = [] if session.tracks is None else [session.tracks.xy_n]
+    points += [] if session.matches is None else [session.matches.xy0_n, session.matches.xy1_n]
+    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
+    (left, top), (right, bottom) = low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3
+    return rrb.Spatial2DView(
+        name=f"Points of {view.name} (normalised)",
+        origin=view.origin,
+        visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
+    )
+
+
+def _map(session: Session, extent: Extent) -> Any:
+    """Zoom so that the path fills most of a map 800 by 260 points (256-point tiles, Web Mercator)."""
+    import rerun.blueprint as rrb
+
+    assert session.origin is not None
+    width, height = (extent.high - extent.low)[:2]
+    metres_a_point = max(width / 800.0, height / 260.0, 1e-3)
+    earth = 40_075_017.0 * float(np.cos(np.radians(session.origin.lat_deg)))
+    zoom = float(np.clip(np.log2(earth / 256.0 / metres_a_point), 1.0, 19.0))
+    return rrb.MapView(name="Map", origin="/geo", zoom=zoom, background=rrb.MapProvider.OpenStreetMap)
+
+
+def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
+    import rerun.blueprint as rrb
+
+    def series(names: Names, first: str = "") -> list[Any]:
+        there = [(name, path) for name, path in names if recorder.has(path)]
+        there.sort(key=lambda item: item[1] != first)
+        return [series_view(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
+
+    raw = series(_SIGNALS)
+    # Without a solution there is room to show every signal at once.
+    shown = _stack(raw, [2.0] * len(raw)) if solution is None else _tabs(series(_MOTION, _FIRST.get(kind, "")) + raw)
+    states = (
+        rrb.StateTimelineView(name="States", origin="/status", time_view=_whole()) if recorder.has("/status") else None
+    )
+    log = rrb.TextLogView(name="Log", origin="/log", columns=log_columns()) if recorder.has("/log") else None
+    count = 2.0 if solution is not None else 2.0 * max(1, len(raw))
+    parts = [
+        shown,
+        _tabs(series(_ACCURACY)),
+        _tabs(series(_FOUND) + series(_clocks(recorder))),
+        _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(recorder, solution)]),
+        states,
+        log,
+    ]
+    statuses = sum(path.startswith("/status/") for path in recorder.paths)
+    return _stack(parts, [count, 2.0, 2.0, 2.0, 0.8 + 0.5 * statuses, 1.8])
+
+
+def _contents(path: str) -> list[str]:
+    # how long an update took, where that recording is there too, beside what it did
+    return [f"{path}/**", "/update/latency"] if path == "/update/effort" else [f"{path}/**"]
+
+
+def _clocks(recorder: Recorder) -> Names:
+    sensors = sorted({path.split("/")[2] for path in recorder.paths if path.startswith("/clock/")})
+    return tuple((f"Clock offset of {sensor} s, bands 1σ 3σ", f"/clock/{sensor}") for sensor in sensors)
+
+
+def _residuals(recorder: Recorder, solution: Solution | None) -> list[Any]:
+    if solution is None:
+        return []
+    sensors = signals.sensors_of(solution.residuals)
+    # Position sensors tell most: they stand first; the inertial residuals are many and small.
+    sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
+    return [
+        series_view(
+            f"Residuals {name} (σ)",
+            [f"/residuals/{name}/**"],
+            legend=_few(solution, name),
+            limits=recorder.limits.get(f"/residuals/{name}"),
+        )
+        for name in sensors
+    ]
+
+
+def _few(solution: Solution, sensor: str) -> bool:
+    return int(solution.residuals.axis[solution.residuals.of(sensor)].max()) < 3
+
+
+def series_view(
+    name: str,
+    contents: list[str],
+    *,
+    legend: bool = True,
+    limits: tuple[float, float] | None = None,
+) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        name=name,
+        origin="/",
+        contents=contents,
+        axis_x=_whole(),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+    )
+
+
+def log_columns() -> Any:
+    """Time, level and text: all lines come from one entity."""
+    from rerun.blueprint.archetypes import TextLogColumns
+    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+    return TextLogColumns(
+        timeline_columns=[TimelineColumn("elapsed")],
+        text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+    )
+
+
+def _whole() -> Any:
+    """The whole recording, on whichever time line is chosen."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    end = rr.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=end, end=end))

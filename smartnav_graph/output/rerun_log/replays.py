@@ -1,0 +1,81 @@
+"""A replay as it went: the window of the moment over the path, the effort of each update, what it corrected.
+
+How long an update took differs from run to run. It stands in a recording of its own, with the same identity, which the
+viewer joins to the first: two runs of the same session then have equal recordings, and latency is still there to see.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.estimate.result.diagnostics import Updates
+from smartnav_graph.graph.solution import POS, Solution
+from smartnav_graph.output.rerun_log import colours
+from smartnav_graph.output.rerun_log.recorder import Recorder
+from smartnav_graph.output.rerun_log.spatial import Scene
+
+# Updates, and points of each window, that are drawn at most.
+MOST_WINDOWS, MOST_POINTS = 2000, 60
+
+
+def log_causal(scene: Scene, causal: Solution, updates: Updates | None) -> None:
+    """The path of what was known at each moment, its latest point, and the window that the moment corrects."""
+    import rerun as rr
+
+    scene.path("causal", causal.nav_t_body, colours.CAUSAL, 1.2)
+    good = np.isfinite(causal.nav_t_body).all(axis=1)
+    at = scene.local(causal.nav_t_body[good])
+    scene.recorder.rows("/world/causal/now", causal.t_ns[good], rr.Points3D.columns(positions=at))
+    style = rr.Points3D.from_fields(colors=colours.CAUSAL, radii=rr.Radius.ui_points(7.0))
+    scene.recorder.style("/world/causal/now", style)
+    scene.ellipsoids(
+        "causal/covariance", causal.t_ns, causal.nav_t_body, causal.covariance[:, POS, POS], colours.CAUSAL
+    )
+    if updates is not None:
+        _log_windows(scene, updates)
+
+
+def _log_windows(scene: Scene, updates: Updates) -> None:
+    """The keyframes that each update could still move, as it left them."""
+    import rerun as rr
+
+    count = len(updates.t_ns)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).astype(int))
+    at = scene.local(updates.past)
+    strips = [at[_some(updates.edge[k], updates.edge[k + 1])] for k in chosen]
+    scene.recorder.rows("/world/causal/window", updates.t_ns[chosen], rr.LineStrips3D.columns(strips=strips))
+    style = rr.LineStrips3D.from_fields(colors=colours.WINDOW, radii=rr.Radius.ui_points(3.0))
+    scene.recorder.style("/world/causal/window", style)
+
+
+def _some(start: int, end: int) -> NDArray[np.intp]:
+    """Rows from start to end, the last one kept, at most MOST_POINTS."""
+    return np.unique(np.linspace(start, end - 1, min(end - start, MOST_POINTS)).astype(np.intp))
+
+
+def log_updates(recorder: Recorder, updates: Updates) -> None:
+    """Effort, correction and doubts of each update, and the session states as it has them."""
+    import rerun as rr
+
+    t = updates.t_ns
+    effort = np.stack([updates.solved, updates.relinearised], axis=1).astype(np.float64)
+    recorder.rows("/update/effort", t, rr.Scalars.columns(scalars=effort))
+    names = ["states solved for", "states relinearised"]
+    recorder.style("/update/effort", rr.SeriesLines(colors=[colours.AXES[2], colours.CAUSAL], names=names))
+    some = updates.doubted > 0
+    recorder.rows("/update/rejected", t[some], rr.Scalars.columns(scalars=updates.doubted[some].astype(np.float64)))
+    style = rr.SeriesPoints(
+        colors=colours.REJECTED, names="rows rejected or doubted", markers="cross", marker_sizes=3.0
+    )
+    recorder.style("/update/rejected", style)
+    recorder.rows("/update/correction", t, rr.Scalars.columns(scalars=updates.corrected))
+    recorder.style("/update/correction", rr.SeriesLines(colors=colours.WINDOW, names="correction of the past"))
+
+
+def log_latency(recorder: Recorder, updates: Updates) -> None:
+    """Wall time of each update, ms: /update/latency."""
+    import rerun as rr
+
+    recorder.rows("/update/latency", updates.t_ns, rr.Scalars.columns(scalars=updates.latency_ms))
+    recorder.style("/update/latency", rr.SeriesLines(colors=colours.AXES[1], names="latency ms"))

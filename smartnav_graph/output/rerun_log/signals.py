@@ -1,0 +1,207 @@
+"""Everything drawn against time: inertial and other signals, biases, sigmas, errors, residuals."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solution
+from smartnav_graph.output.rerun_log import colours
+from smartnav_graph.output.rerun_log.events import stops
+from smartnav_graph.output.rerun_log.recorder import Recorder, readable
+from smartnav_graph.session.session import Session
+
+MARKER_SIZE = 2.0
+MANY = 500
+EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
+
+
+def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
+    """Raw signals, in body axes and SI units (magnetic field uT, pressure hPa, temperature deg C)."""
+    columns: list[tuple[str, Any, str]] = [
+        ("/imu/accel", session.imu, "accel"),
+        ("/imu/gyro", session.imu, "gyro"),
+        ("/magnetometer", session.magnetometer, "field_ut"),
+        ("/barometer", session.barometer, "pressure_hpa"),
+        ("/temperature", session.temperature, "temperature_c"),
+        ("/velocity", session.velocity, "velocity"),
+        ("/wheel", session.wheel, "speed"),
+    ]
+    for path, stream, quantity in columns:
+        if stream is not None:
+            names = ["x", "y", "z"] if getattr(stream, quantity).ndim == 2 else [quantity]
+            _log_lines(recorder, path, stream.t_ns, getattr(stream, quantity), names)
+            recorder.clear(path, stops(stream.t_ns, end_ns))
+
+
+def _log_lines(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, names: list[str]) -> None:
+    import rerun as rr
+
+    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
+    recorder.style(path, rr.SeriesLines(colors=colours.of_axes(len(names)), names=names, widths=[1.0] * len(names)))
+
+
+def log_bands(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    sigmas: Floats,
+    names: list[str],
+    unit: str,
+    colors: list[list[int]] | None = None,
+) -> None:
+    """Lines with bands of one sigma, and at `path`/three_sigma of three: values and sigmas (n, k)."""
+    import rerun as rr
+
+    colors = colors or colours.of_axes(len(names))
+    for where, times in ((path, 1.0), (f"{path}/three_sigma", 3.0)):
+        columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
+        recorder.rows(where, t_ns, columns)
+        style = rr.Measurements.from_fields(
+            names=names,
+            units=[unit] * len(names),
+            colors=colors,
+            widths=[1.5 if times == 1.0 else 0.0] * len(names),
+        )
+        recorder.style(where, style)
+    recorder.widen(path, values - 3.0 * sigmas, values + 3.0 * sigmas)
+
+
+def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -> None:
+    """Biases with their bands; the error with its bands where a reference is known, else the sigma itself."""
+    sigma, t = solution.sigmas, solution.t_ns
+    axes = ["x", "y", "z"]
+    log_bands(recorder, "/bias/accel", t, solution.accel_bias, sigma[:, ACCEL_BIAS], axes, "m/s²")
+    log_bands(recorder, "/bias/gyro", t, solution.gyro_bias, sigma[:, GYRO_BIAS], axes, "rad/s")
+    _log_lines(recorder, "/sigma/position", t, sigma[:, POS], ["east", "north", "up"])
+    _log_lines(recorder, "/sigma/heading", t, solution.sigma_heading_deg[:, None], ["heading"])
+    recorder.limits["/sigma/position"] = readable(0.0, float(np.nanmax(sigma[:, POS], initial=1e-3)))
+    recorder.limits["/sigma/heading"] = readable(0.0, float(np.nanmax(solution.sigma_heading_deg, initial=1e-3)))
+    if evaluation is not None:
+        _log_error(recorder, evaluation)
+
+
+def log_motion(recorder: Recorder, solution: Solution) -> None:
+    """Speed, height, heading, pitch and roll: what the path is made of."""
+    import rerun as rr
+
+    t, angles = solution.t_ns, solution.heading_pitch_roll_deg
+    speed = np.linalg.norm(solution.nav_v_body, axis=1)[:, None]
+    _log_lines(recorder, "/motion/speed", t, speed, ["speed"])
+    _log_lines(recorder, "/motion/height", t, solution.nav_t_body[:, 2:], ["up"])
+    _log_lines(recorder, "/motion/attitude/tilt", t, angles[:, 1:], ["pitch", "roll"])
+    # points: a line would run through the whole picture where north is passed
+    recorder.rows("/motion/attitude/heading", t, rr.Scalars.columns(scalars=angles[:, :1]))
+    style = rr.SeriesPoints(colors=colours.AXES[2], names="heading", markers="circle", marker_sizes=1.5)
+    recorder.style("/motion/attitude/heading", style)
+
+
+def _log_error(recorder: Recorder, evaluation: Any) -> None:
+    t, error = np.asarray(evaluation.t_ns), np.asarray(evaluation.error_enu_m)
+    sigma, names = getattr(evaluation, "sigma_enu", None), ["east", "north", "up"]
+    if sigma is None:
+        _log_lines(recorder, "/error/position", t, error, names)
+    else:
+        log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m")
+    rotation = getattr(evaluation, "rotation_error_deg", None)
+    if rotation is not None and np.isfinite(rotation).any():
+        known = np.isfinite(rotation)
+        _log_lines(recorder, "/error/rotation", t[known], np.asarray(rotation)[known, None], ["rotation"])
+
+
+class Marks(NamedTuple):
+    """How the points of each axis are drawn: names and colours of the axes, shape and size of all."""
+
+    names: list[str]
+    colors: list[list[int]]
+    shape: str
+    size: float
+
+    def of(self, axis: int) -> Marks:
+        """Those of one axis."""
+        return self._replace(names=self.names[axis : axis + 1], colors=self.colors[axis : axis + 1])
+
+
+def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:
+    """Times (n,) and whitened residuals (n, axes) of one sensor; NaN where an axis has none.
+
+    Several residuals of one axis at one time (many matches of an image pair) become rows with the same time.
+    """
+    chosen = residuals.of(sensor)
+    width = int(residuals.axis[chosen].max()) + 1
+    rows = np.flatnonzero(chosen & (residuals.used == used))
+    if not len(rows):
+        return np.zeros(0, dtype=np.int64), np.zeros((0, width))
+    order = rows[np.lexsort((residuals.axis[rows], residuals.t_ns[rows]))]
+    t, axis = residuals.t_ns[order], residuals.axis[order]
+    new = np.concatenate([[True], (np.diff(t) != 0) | (np.diff(axis) != 0)])
+    place = np.arange(len(order))
+    repeat = place - np.maximum.accumulate(np.where(new, place, 0))
+    keys, row = np.unique(np.stack([t, repeat], axis=1), axis=0, return_inverse=True)
+    table = np.full((len(keys), width), np.nan)
+    table[row.ravel(), axis] = residuals.whitened[order]
+    return keys[:, 0], table
+
+
+def sensors_of(residuals: Residuals) -> list[str]:
+    """Names of the sensors with residuals, sorted."""
+    return sorted({str(name) for name in residuals.sensor})
+
+
+def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
+    """Whitened residuals a sensor: /residuals/<sensor>, and what was not used at /residuals/<sensor>/rejected."""
+    for sensor in sensors_of(residuals):
+        path = f"/residuals/{sensor}"
+        used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
+        width = used[1].shape[1]
+        names = [axis_name(k, width) for k in range(width)]
+        _log_axes(recorder, path, *used, Marks(names, colours.of_axes(width), "circle", MARKER_SIZE))
+        # crosses, small ones where there are so many that they would cover all else
+        size = (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
+        crosses = Marks(["rejected ×"] * width, [colours.REJECTED] * width, "cross", size)
+        _log_axes(recorder, f"{path}/rejected", *rejected, crosses)
+        if len(rejected[0]):
+            limit = _limit(np.abs(used[1]), np.abs(rejected[1]))
+            recorder.limits[path] = readable(-limit, limit)
+
+
+def _limit(used: Floats, rejected: Floats) -> float:
+    """How far a plot of residuals reaches: what is used must still be seen where what was rejected is large."""
+    inside = float(np.nanpercentile(used, 99.9)) if np.isfinite(used).any() else 3.0
+    return max(1.2 * inside, min(1.1 * float(np.nanpercentile(rejected, 75)), 5.0 * inside))
+
+
+def _log_axes(
+    recorder: Recorder,
+    path: str,
+    t_ns: NDArray[np.int64],
+    values: Floats,
+    marks: Marks,
+) -> None:
+    """Points of all axes in one entity, or each in its own where rows have not the same axes: two recordings with NaN
+    in them never compare equal."""
+    there = np.isfinite(values)
+    if there.all():
+        _log_points(recorder, path, t_ns, values, marks)
+        return
+    for k, mask in enumerate(there.T):
+        _log_points(recorder, f"{path}/{k}", t_ns[mask], values[mask, k : k + 1], marks.of(k))
+
+
+def _log_points(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, marks: Marks) -> None:
+    import rerun as rr
+
+    recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
+    if len(t_ns):
+        shapes, sizes = [marks.shape] * len(marks.names), [marks.size] * len(marks.names)
+        style = rr.SeriesPoints(colors=marks.colors, names=marks.names, markers=shapes, marker_sizes=sizes)
+        recorder.style(path, style)
+
+
+def axis_name(axis: int, width: int) -> str:
+    """East, north, up of a position; the axis number of anything else."""
+    return ("east", "north", "up")[axis] if width == 3 else f"axis {axis}" if width > 1 else "residual"

@@ -1,0 +1,85 @@
+"""Opening recordings, sessions and runs in the Rerun viewer."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.session.session import load
+
+
+def recordings(paths: Iterable[str | Path], scratch: Path) -> list[Path]:
+    """The .rrd files of each recording, run folder (run.rrd inside, latency.rrd of a replay) or session folder (written
+    to `scratch`).
+
+    Raises
+    ------
+    SessionError
+        A path is none of these.
+    """
+    return [file for number, path in enumerate(paths) for file in _recordings(Path(path), scratch / f"{number}.rrd")]
+
+
+def _recordings(path: Path, new: Path) -> list[Path]:
+    from smartnav_graph.output.rerun_log import write_recording
+
+    if path.is_file() and path.suffix == ".rrd":
+        return [path]
+    if (path / "run.rrd").is_file():
+        return [file for name in ("run.rrd", "latency.rrd") if (file := path / name).is_file()]
+    if (path / "session.toml").is_file():
+        write_recording(new, session=load(path), solution=None)
+        return [new]
+    found = "does not exist" if not path.exists() else "holds no run.rrd and no session.toml"
+    raise SessionError(path, found, "a .rrd file, a run folder or a session folder", "check the path")
+
+
+def view(paths: Iterable[str | Path], web: bool = False) -> None:
+    """Show recordings, runs and sessions in the Rerun viewer; returns when the viewer is closed.
+
+    Parameters
+    ----------
+    paths : .rrd files, run folders, session folders; several open beside each other
+    web : serve the viewer to a browser instead of opening a window
+
+    Raises
+    ------
+    SessionError
+        A path is no recording, run or session.
+    SmartnavError
+        There is no display for a window, or the viewer ended with an error.
+    """
+    if not web:
+        _require_display()
+    with tempfile.TemporaryDirectory(prefix="smartnav-view-") as scratch:
+        files = recordings(paths, Path(scratch))
+        # Only this machine may connect: the viewer listens to the whole network otherwise.
+        options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
+        command = [str(executable()), *options, *(str(file.resolve()) for file in files)]
+        code = subprocess.run(command, check=False).returncode
+    if code not in (0, -2, 130):  # closed, or interrupted by the user
+        raise SmartnavError("Rerun viewer", f"ended with code {code}", "0", "read its messages above, or try --web")
+
+
+def _require_display() -> None:
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise SmartnavError(
+            "Rerun viewer",
+            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set)",
+            "a graphical desktop",
+            "add --web to serve it to a browser, or copy the .rrd file to a desktop and open it there",
+        )
+
+
+def executable() -> Path:
+    """The viewer's binary: its Python wrapper would leave the window behind when it is interrupted."""
+    package = importlib.util.find_spec("rerun_cli")
+    if package is None or package.origin is None:
+        raise SmartnavError("Rerun viewer", "is not installed", "the package rerun-sdk", "pip install rerun-sdk")
+    return Path(package.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")

@@ -1,0 +1,131 @@
+"""Two runs beside each other: how far apart their states are, and what else tells them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from smartnav_graph.evaluation.compare import MEASURES, Comparison, Measure, compare, figure_differences, rejected_sets
+from smartnav_graph.output.run_folder import StoredRun, config_differences
+
+# Rows of one sensor that only one run rejected, told one by one.
+FEW = 8
+COLUMNS = ("RMS", "median", "95 %", "largest", "at s", "in sigmas", "sigma 2/1")
+MEANING = (
+    "in sigmas: the largest difference over the larger sigma of the two runs; "
+    "sigma 2/1: median sigma of the second run over that of the first"
+)
+
+
+@dataclass(frozen=True)
+class RunDifferences:
+    """States, options (``section.field`` -> the value of each), rejected rows by sensor, figures of summary.json."""
+
+    first: StoredRun
+    second: StoredRun
+    states: Comparison
+    config: Mapping[str, tuple[Any, Any]]
+    rejected: Mapping[str, Mapping[str, Any]]
+    figures: Mapping[str, tuple[Any, Any]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Every difference."""
+        tables = {"config": self.config, "rejected": self.rejected, "figures": self.figures}
+        return {"first": str(self.first.path), "second": str(self.second.path), **self.states.to_dict(), **tables}
+
+    def to_text(self) -> str:
+        """For people: tables in fixed width."""
+        states = "\n".join([self._title(), *self._states()])
+        tables = [table for name in ("config", "figures") if (table := self._table(name))]
+        return "\n\n".join([states, *tables, *(["\n".join(lines)] if (lines := list(self._rejected())) else [])])
+
+    def to_markdown(self) -> str:
+        """The same as a document."""
+        names, rows = COLUMNS, [self._row(measure) for measure in MEASURES]
+        tables = [_markdown(("", *names), rows), MEANING]
+        for name in ("config", "figures"):
+            told = [(key, _told(one), _told(other)) for key, (one, other) in getattr(self, name).items()]
+            tables += [_markdown((name, self.first.path.name, self.second.path.name), told)] if told else []
+        return "\n\n".join([self._title(), *tables, *(f"- {line}" for line in self._rejected())])
+
+    def write_recording(self, path: Path, *, force: bool) -> None:
+        """Both runs as one recording; see `rerun_log.comparison`."""
+        from smartnav_graph.output.rerun_log.comparison import write_comparison
+
+        write_comparison(
+            path,
+            self.first.solution,
+            self.second.solution,
+            self.states,
+            names=(self.first.path.name, self.second.path.name),
+            clock_epoch=self.first.clock_epoch,
+            report_markdown=self.to_markdown(),
+            force=force,
+        )
+
+    def _title(self) -> str:
+        counts = [len(run.solution) for run in (self.first, self.second)]
+        few = "; the same --rate HZ gives both more of them" if 2 * len(self.states) < min(counts) else ""
+        common = f"{len(self.states)} common epochs (of {counts[0]} and {counts[1]}{few})"
+        return f"{self.second.path} less {self.first.path} at {common}"
+
+    def _states(self) -> Iterator[str]:
+        yield f"{'':<16}{''.join(f'{name:>11}' for name in COLUMNS)}"
+        for measure in MEASURES:
+            name, *told = self._row(measure)
+            yield f"{name:<16}{''.join(f'{text:>11}' for text in told)}"
+        yield MEANING
+
+    def _row(self, measure: Measure) -> tuple[str, ...]:
+        one = self.states.apart(measure)
+        s = one.statistics
+        figures = [f"{value:.4g}" for value in (s.rmse, s.p50, s.p95, s.max)]
+        name = f"{measure.name.split('_')[0]}{' bias' if 'bias' in measure.name else ''} {measure.unit}"
+        return (name, *figures, f"{one.largest_at_s:.2f}", f"{one.largest_sigmas:.2f}", f"{one.sigma_ratio:.3f}")
+
+    def _table(self, name: str) -> str:
+        rows: Mapping[str, tuple[Any, Any]] = getattr(self, name)
+        return "\n".join(f"{name:<8} {key}: {_told(one)} | {_told(other)}" for key, (one, other) in rows.items())
+
+    def _rejected(self) -> Iterator[str]:
+        for sensor, sets in self.rejected.items():
+            only = [f"only in {which}: {_rows(sets[f'only_{which}'])}" for which in ("first", "second")]
+            yield f"rejected {sensor}: in both {sets['both']}, {', '.join(only)}"
+
+
+def compare_runs(first: StoredRun, second: StoredRun) -> RunDifferences:
+    """The differences of two runs of one session.
+
+    Raises
+    ------
+    SessionError
+        They have no time in common.
+    """
+    return RunDifferences(
+        first=first,
+        second=second,
+        states=compare(first.solution, second.solution),
+        config=config_differences(first.path, second.path),
+        rejected=rejected_sets(first.summary, second.summary),
+        figures=figure_differences(first.summary, second.summary),
+    )
+
+
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _rows(rows: list[int]) -> str:
+    """How many rows, and which where they are few."""
+    return f"{len(rows)} (rows {', '.join(map(str, rows))})" if 0 < len(rows) <= FEW else str(len(rows))
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_told, value))}]"
+    return "-" if value is None else str(value)

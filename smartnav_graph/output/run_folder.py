@@ -1,0 +1,312 @@
+"""The folder a run leaves behind, and reading it back.
+
+trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
+keyframes.parquet, influence.parquet (the linear system at the solution, see `influence`), summary.json, config.toml,
+calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.estimate import config as config_model
+from smartnav_graph.estimate.run import Run
+from smartnav_graph.evaluation import Evaluation
+from smartnav_graph.evaluation.influence import Influence
+from smartnav_graph.graph import solution as solution_model
+from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.output.export import write_trajectory_csv
+from smartnav_graph.session.calibration import model as calibration_model
+from smartnav_graph.session.session import Session, write_table
+
+SUMMARY = "summary.json"
+UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run read back: the smoothed states, the causal ones of a replay, and the table of summary.json."""
+
+    path: Path
+    solution: Solution
+    summary: Mapping[str, Any]
+    causal: Solution | None = None
+
+    @property
+    def clock_epoch(self) -> str:
+        return str(self.summary["session"].get("clock_epoch", "unknown"))
+
+    def named(self, name: str) -> Solution:
+        """The ``smoothed`` or the ``causal`` solution.
+
+        Raises
+        ------
+        SessionError
+            A causal one is asked of a batch run.
+        """
+        if name == "smoothed":
+            return self.solution
+        if self.causal is None:
+            raise SessionError(self.path, "has no causal solution", "a replayed run", "make one with `smartnav replay`")
+        return self.causal
+
+
+def check_out(path: str | Path, force: bool) -> None:
+    """Raise unless a run may be written to `path`: a free place, or with `force` an older run.
+
+    Raises
+    ------
+    SessionError
+        Something stands there.
+    """
+    refuse_existing(Path(path), force)
+    refuse_foreign(path, SUMMARY)
+
+
+def write_run(
+    run: Run,
+    path: str | Path,
+    *,
+    force: bool = False,
+    report: bool = True,
+    recording: bool = True,
+    evaluation: Evaluation | None = None,
+    load_s: float = 0.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Write the folder of a run, all or nothing.
+
+    Parameters
+    ----------
+    run : what `estimate.smooth` or `estimate.replay` gave
+    force : replace an older run; a folder that is no run is never replaced
+    report, recording : write report.html, run.rrd
+    evaluation : comparison with a reference, shown in both and told in summary.json
+    load_s : seconds that reading the session took
+    progress : told what is being written
+
+    Returns
+    -------
+    The table of summary.json.
+
+    Raises
+    ------
+    SessionError
+        The place is taken, or the system refuses to write; what stood there is untouched.
+    """
+    check_out(path, force)
+    begin = time.perf_counter()
+    told = dict(run.summary)
+    told["session"] = dict(told.get("session", {})) | _session_key(run)
+    if evaluation is not None:
+        told["evaluation"] = evaluation.to_dict()
+    told["timings_s"] = {"load": round(load_s, 4), **told.get("timings_s", {})}
+    with replacing(path, force=force) as folder:
+        try:
+            folder.mkdir()
+            progress("writing tables", 0, 0)
+            _write_tables(run, folder)
+            (folder / "config.toml").write_text(config_model.dumps(run.problem.config), encoding="utf-8")
+            calibration = calibration_model.dumps(run.problem.calibration)
+            (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
+            _write_views(run, folder, plain(told), evaluation, report, recording, progress)
+            summary = plain(_timed(told, load_s, time.perf_counter() - begin))
+            text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+            (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
+        except SessionError as error:  # from a file inside: speak of the run, not of the temporary name
+            raise error.located(path) from error
+    return dict(summary)
+
+
+def _session_key(run: Run) -> dict[str, Any]:
+    """What reading the states back needs of the session."""
+    solution, session = run.solution, run.session
+    return {
+        "source": None if session.path is None else str(session.path),
+        "clock_epoch": session.clock_epoch,
+        "t0_ns": solution.t0_ns,
+        "forward": solution.forward,
+        "up": solution.up,
+        "origin": None if solution.origin is None else dataclasses.asdict(solution.origin),
+    }
+
+
+def _timed(told: Mapping[str, Any], load_s: float, write_s: float) -> dict[str, Any]:
+    """With loading and writing in the timings, the total and the real-time factor."""
+    timings = dict(told["timings_s"])
+    total = timings.pop("total", 0.0) + load_s + write_s
+    timings |= {"write": round(write_s, 4), "total": round(total, 4)}
+    return {**told, "timings_s": timings, "real_time_factor": round(told["duration_s"] / max(total, 1e-9), 2)}
+
+
+def _write_tables(run: Run, folder: Path) -> None:
+    states = {"trajectory": ("solution", run.solution)}
+    if run.causal is not None:
+        states["causal"] = ("causal", run.causal)
+    for text, (table, solution) in states.items():
+        write_trajectory_csv(solution, folder / f"{text}.csv")
+        write_table(solution.all_columns(), folder / f"{table}.parquet")
+    write_table(residual_columns(run.solution.residuals), folder / "residuals.parquet")
+    rows = withheld_columns(run)
+    if rows:
+        write_table(rows, folder / "withheld.parquet")
+    if run.estimate is not None:
+        Influence.of(run.estimate, run.problem.windows).write(folder)
+
+
+def residual_columns(residuals: Residuals) -> dict[str, Any]:
+    """The columns of residuals.parquet."""
+    return {
+        "t_ns": residuals.t_ns,
+        "sensor": np.asarray(residuals.sensor, dtype=str),
+        "axis": residuals.axis,
+        "residual": residuals.whitened,
+        "weight": residuals.weight,
+        "used": residuals.used,
+    }
+
+
+def withheld_columns(run: Run) -> dict[str, Any]:
+    """The columns of withheld.parquet: predicted minus recorded, metres; empty without withheld rows."""
+    if not run.withheld:
+        return {}
+    names = [np.full(len(rows.t_ns), name) for name, rows in run.withheld.items()]
+    error = np.concatenate([rows.error for rows in run.withheld.values()])
+    t_ns = np.concatenate([rows.t_ns for rows in run.withheld.values()])
+    errors = dict(zip(("de_m", "dn_m", "du_m"), error.T, strict=True))
+    return {"t_ns": t_ns, "sensor": np.concatenate(names)} | errors
+
+
+def recorded(run: Run) -> Session:
+    """The session of a run with the rows kept back, as far as the run reaches, at their places again."""
+    whole: dict[str, Any] = {}
+    start, end = run.solution.t_ns[[0, -1]]
+    for name, held in run.problem.withheld.items():
+        rows = held.take((held.t_ns >= start) & (held.t_ns <= end))
+        kept = getattr(run.session, name)
+        parts = [rows.columns()] if kept is None else [kept.columns(), rows.columns()]
+        table = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+        order = np.argsort(table["t_ns"], kind="stable")
+        whole[name] = type(rows).from_columns({column: values[order] for column, values in table.items()})
+    return run.session.replace(**whole)
+
+
+def _write_views(
+    run: Run,
+    folder: Path,
+    told: Mapping[str, Any],
+    evaluation: Evaluation | None,
+    report: bool,
+    recording: bool,
+    progress: Progress,
+) -> None:
+    from smartnav_graph.output.report import report_markdown, write_report
+    from smartnav_graph.output.rerun_log import write_latency, write_recording
+
+    common: dict[str, Any] = {"session": recorded(run), "solution": run.solution, "summary": told}
+    common |= {"evaluation": evaluation, "causal": run.causal}
+    if recording:
+        progress("writing the recording", 0, 0)
+        # a summary without its timings: equal runs give equal recordings
+        steady = {key: value for key, value in told.items() if key not in UNSTEADY}
+        markdown = report_markdown(steady, evaluation)
+        identity = write_recording(folder / "run.rrd", report_markdown=markdown, trace=run.trace, **common)
+        if run.trace is not None and run.trace.updates is not None:
+            write_latency(folder / "latency.rrd", session=run.session, trace=run.trace, identity=identity)
+    if report:
+        progress("writing the report", 0, 0)
+        updates = None if run.trace is None else run.trace.updates
+        write_report(folder / "report.html", withheld=run.withheld, updates=updates, **common)
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON types: no NumPy scalar, and null for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def read_run(path: str | Path) -> StoredRun:
+    """The run that a folder holds.
+
+    Raises
+    ------
+    SessionError
+        It is no run folder, or a file in it cannot be read.
+    """
+    path = Path(path)
+    if not (path / SUMMARY).is_file():
+        found = f"holds no {SUMMARY}" if path.is_dir() else "is no folder"
+        raise SessionError(path, found, "a run folder", "make one with `smartnav smooth`")
+    try:
+        summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
+        session = summary["session"]
+        origin = session["origin"]
+        key = {
+            "t0_ns": int(session["t0_ns"]),
+            "origin": None if origin is None else Origin(**origin),
+            "forward": session["forward"],
+            "up": session["up"],
+        }
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(
+            path / SUMMARY, f"cannot be read ({error!r})", "the summary of a run", "smooth the session again"
+        ) from error
+    causal = path / "causal.parquet"
+    return StoredRun(
+        path=path,
+        solution=_read_states(path / "solution.parquet", key, _read_residuals(path / "residuals.parquet")),
+        summary=summary,
+        causal=_read_states(causal, key) if causal.is_file() else None,
+    )
+
+
+def _read_states(path: Path, key: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:
+    try:
+        return solution_model.from_columns(solution_model.read(path), residuals=residuals, **key)
+    except (OSError, KeyError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from error
+
+
+def _read_residuals(path: Path) -> Residuals:
+    try:
+        columns = solution_model.read(path)
+        renamed = {("whitened" if name == "residual" else name): column for name, column in columns.items()}
+        return Residuals(**renamed)
+    except (OSError, TypeError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> SessionError:
+    return SessionError(path, f"cannot be read ({error})", "a table of a run", "smooth the session again")
+
+
+def config_differences(first: str | Path, second: str | Path) -> dict[str, tuple[Any, Any]]:
+    """Options that two runs have not in common: ``section.field`` -> the value of each, None where it is not set."""
+
+    def flat(path: str | Path) -> dict[str, Any]:
+        table = dataclasses.asdict(config_model.load(Path(path) / "config.toml"))
+        return {f"{room}.{name}": value for room, fields in table.items() for name, value in fields.items()}
+
+    one, other = flat(first), flat(second)
+    return {key: (one[key], other[key]) for key in one if one[key] != other[key]}

@@ -1,0 +1,236 @@
+"""What is known of a device: noise of its sensors and, later, their deterministic errors; <-> calibration.toml.
+
+Noise densities follow IEEE Std 952: white noise in unit/sqrt(Hz), bias random walk in unit*sqrt(Hz) per second.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cattrs
+import tomli_w
+
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.core.files import read_toml
+from smartnav_graph.session.calibration.camera import Camera
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Inertial noise that the estimator assumes (not the data sheet's: vibration, quantisation, scale errors included).
+
+    accel_noise_density m/s^2/sqrt(Hz), gyro_noise_density rad/s/sqrt(Hz), accel_bias_walk m/s^3/sqrt(Hz),
+    gyro_bias_walk rad/s^2/sqrt(Hz); turn-on bias sigmas m/s^2 and rad/s.
+    """
+
+    accel_noise_density: float
+    gyro_noise_density: float
+    accel_bias_walk: float
+    gyro_bias_walk: float
+    accel_bias_sigma: float
+    gyro_bias_sigma: float
+
+
+@dataclass(frozen=True)
+class GnssNoise:
+    """Noise of position fixes, metres.
+
+    horizontal_sigma, vertical_sigma : white part of fixes that carry no sigma of their own
+    correlated_horizontal_sigma, correlated_vertical_sigma, correlated_time : first-order Gauss-Markov part of code
+    receivers, m and s; zero sigma for a receiver whose errors do not wander
+    velocity_horizontal_sigma, velocity_vertical_sigma : m/s, of velocities that carry no sigma of their own
+    """
+
+    horizontal_sigma: float = 3.0
+    vertical_sigma: float = 5.0
+    correlated_horizontal_sigma: float = 4.0
+    correlated_vertical_sigma: float = 6.0
+    correlated_time: float = 60.0
+    velocity_horizontal_sigma: float = 0.3
+    velocity_vertical_sigma: float = 0.5
+
+    @property
+    def wanders(self) -> bool:
+        return self.correlated_horizontal_sigma > 0 and self.correlated_vertical_sigma > 0
+
+
+@dataclass(frozen=True)
+class VehicleNoise:
+    """Speeds (m/s) that a vehicle on wheels should not have and has: sideways, up, and of its wheels over the road."""
+
+    lateral_sigma: float
+    vertical_sigma: float
+    wheel_sigma: float
+
+
+# One default a vehicle on wheels. Castors follow the push, and a trolley's load rocks, at a tenth of a car's speed.
+VEHICLE_CLASSES: dict[str, VehicleNoise] = {
+    "car": VehicleNoise(lateral_sigma=0.15, vertical_sigma=0.15, wheel_sigma=0.1),
+    "trolley": VehicleNoise(lateral_sigma=0.1, vertical_sigma=0.05, wheel_sigma=0.05),
+}
+
+
+@dataclass(frozen=True)
+class BarometerNoise:
+    """pressure_sigma : hPa, white, a sample; pressure_walk : hPa/sqrt(s), weather, draughts and the sensor itself."""
+
+    pressure_sigma: float = 0.03
+    pressure_walk: float = 0.003
+
+
+@dataclass(frozen=True)
+class PoseFixNoise:
+    """Pose fixes that carry no sigma of their own, as of image recognition: position m, attitude rad, each an axis."""
+
+    position_sigma: float = 0.3
+    attitude_sigma: float = 0.035
+
+
+@dataclass(frozen=True)
+class StepNoise:
+    """What is known of a walker before the first step.
+
+    factor : metres of a step over the fourth root of the swing of the specific force (m/s^2), with its sigma;
+    sideways_sigma : the same across the forward axis of the device, zero on average; step_sigma : m/sqrt(s), by which
+    steps that share one factor differ
+    """
+
+    factor: float = 0.45
+    factor_sigma: float = 0.15
+    sideways_sigma: float = 0.1
+    step_sigma: float = 0.2
+
+
+# One default a device class, the same for every recording.
+DEVICE_CLASSES: dict[str, ImuNoise] = {
+    # Consumer MEMS in phones and loggers, used in motion: about five times the white noise of a device at rest, to
+    # cover vibration, scale factor and misalignment.
+    "mems": ImuNoise(
+        accel_noise_density=0.03,
+        gyro_noise_density=3e-4,
+        accel_bias_walk=3e-4,
+        gyro_bias_walk=1e-5,
+        accel_bias_sigma=0.3,
+        gyro_bias_sigma=0.05,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class MagnetometerNoise:
+    """Errors of a magnetometer, uT: reading = nav_R_body^T (field + disturbance) + hard iron + white, before soft iron.
+
+    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : what iron nearby adds to the Earth's field as
+    the device moves, and how long it stays alike
+    hard_iron_ut : constant offset in body axes, hard_iron_sigma_ut : how sure; that of a phone whose system calibrates
+    soft_iron : row-major (3, 3), the corrected reading is soft_iron (reading - hard iron)
+    """
+
+    sigma_ut: float = 0.5
+    disturbance_ut: float = 3.0
+    disturbance_s: float = 2.0
+    hard_iron_ut: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hard_iron_sigma_ut: float = 15.0
+    soft_iron: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        numbers = (*self.hard_iron_ut, *self.soft_iron, self.sigma_ut, self.disturbance_ut, self.disturbance_s)
+        positive = min(self.sigma_ut, self.disturbance_s, self.hard_iron_sigma_ut) > 0 and self.disturbance_ut >= 0
+        if not (all(map(math.isfinite, numbers)) and positive and len(self.soft_iron) == 9):
+            expected = "finite numbers, sigmas > 0, the nine of soft_iron"
+            raise CalibrationError("calibration.toml", f"{self}", expected, "give uT and s")
+
+
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+# Largest departure of a matrix from the identity: more is a matter of axes or units, not of calibration.
+LARGEST_ERROR = 0.3
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """Deterministic errors of the inertial sensors: true = matrix (reading - bias).
+
+    accel_matrix, gyro_matrix : row-major (3, 3), scale factors and misalignments; accel_bias m/s^2, gyro_bias rad/s :
+    about which the bias states of a session stand
+    """
+
+    accel_matrix: tuple[float, ...] = _IDENTITY
+    gyro_matrix: tuple[float, ...] = _IDENTITY
+    accel_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("accel_matrix", "gyro_matrix"):
+            matrix = getattr(self, name)
+            if len(matrix) != 9 or not all(abs(a - b) <= LARGEST_ERROR for a, b in zip(matrix, _IDENTITY, strict=True)):
+                expected = f"nine numbers within {LARGEST_ERROR} of the identity, row by row"
+                raise CalibrationError(
+                    "calibration.toml", f"{name} = {list(matrix)}", expected, "turn axes in a reader"
+                )
+        if not all(map(math.isfinite, (*self.accel_bias, *self.gyro_bias))):
+            raise CalibrationError("calibration.toml", f"{self}", "finite biases", "give m/s^2 and rad/s")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Device calibration as it stands in calibration.toml; `cameras` by the name that images carry."""
+
+    device: str = "unknown"
+    device_class: str = "mems"
+    imu_noise: ImuNoise = field(default_factory=lambda: DEVICE_CLASSES["mems"])
+    gnss_noise: GnssNoise = field(default_factory=GnssNoise)
+    pose_fix_noise: PoseFixNoise = field(default_factory=PoseFixNoise)
+    barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
+    step_noise: StepNoise = field(default_factory=StepNoise)
+    magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
+    imu_errors: ImuErrors = field(default_factory=ImuErrors)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for room in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
+            for f in dataclasses.fields(room):
+                value = getattr(room, f.name)
+                may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
+                if not (math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
+                    raise CalibrationError(
+                        "calibration.toml", f"{f.name} = {value}", "a finite number > 0", "give SI units"
+                    )
+
+
+_converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+def from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
+    """Calibration of a parsed TOML table; missing rooms take the class default, unknown keys are refused."""
+    filled = dict(data)
+    name = filled.get("device_class", "mems")
+    if name not in DEVICE_CLASSES:
+        raise CalibrationError(where, f"device_class = {name!r}", f"one of {', '.join(DEVICE_CLASSES)}")
+    filled["imu_noise"] = dataclasses.asdict(DEVICE_CLASSES[name]) | dict(filled.get("imu_noise", {}))
+    try:
+        return _converter.structure(filled, Calibration)
+    except CalibrationError as error:
+        raise error.located(where) from error
+    except Exception as error:
+        raise CalibrationError(where, "; ".join(cattrs.transform_error(error)), "known keys with numbers") from error
+
+
+def load(path: str | Path) -> Calibration:
+    """Read calibration.toml.
+
+    Raises
+    ------
+    CalibrationError
+        Missing or unreadable file, unknown key, or a value that is not > 0.
+    """
+    return from_dict(read_toml(Path(path), CalibrationError, "a calibration.toml"), path)
+
+
+def dumps(calibration: Calibration) -> str:
+    """The text of calibration.toml; `from_dict` of it gives the same calibration."""
+    return tomli_w.dumps(dataclasses.asdict(calibration))

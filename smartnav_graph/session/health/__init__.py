@@ -1,0 +1,129 @@
+"""Is a recorded session what it says? Rates, gaps, units, signs, overlaps: looked at before anything is estimated.
+
+Nothing is repaired here. Every rule is a small generator of findings; `RULES` is the list of them: those of any stream
+in `streams`, of the inertial stream in `inertial`, of positions in `positions`, of the other sensors in `sensors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import Gap, find_gaps, seconds_since
+from smartnav_graph.session.health import inertial, positions, sensors, streams
+from smartnav_graph.session.health.facts import AIDING, Facts, Finding
+from smartnav_graph.session.health.inertial import quiet_accel, tilt_errors
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ABSOLUTE, Stream
+
+__all__ = ["AIDING", "Finding", "Health", "StreamHealth", "inspect", "quiet_accel", "tilt_errors"]
+
+
+@dataclass(frozen=True)
+class StreamHealth:
+    """Rows of one stream; start in seconds since time zero, length in seconds, mean rate in Hz (NaN for one row)."""
+
+    name: str
+    rows: int
+    start_s: float
+    length_s: float
+    rate_hz: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """What a session holds and what was noticed. Accelerations m/s^2; gaps are those of the inertial stream."""
+
+    streams: tuple[StreamHealth, ...]
+    gaps: tuple[Gap, ...]
+    clock_epoch: str
+    gravity_m_s2: float
+    quiet_accel_m_s2: float | None
+    missing: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    t0_ns: int
+
+    def warnings(self) -> list[str]:
+        """The warnings, each ``<where>: <found>; <remedy>``."""
+        return [str(finding) for finding in self.findings if finding.level == "warning"]
+
+    def raise_errors(self) -> None:
+        """Raise the first finding of level error.
+
+        Raises
+        ------
+        SessionError
+            The session cannot be estimated from.
+        """
+        for finding in self.findings:
+            if finding.level == "error":
+                raise SessionError(finding.where, finding.text, remedy=finding.remedy)
+
+    def to_text(self) -> str:
+        """Plain lines for a terminal."""
+        lines = [f"{'stream':<14}{'rows':>9}{'start s':>12}{'length s':>12}{'rate Hz':>10}"]
+        lines += [
+            f"{s.name:<14}{s.rows:>9}{s.start_s:>12.3f}{s.length_s:>12.3f}{s.rate_hz:>10.2f}" for s in self.streams
+        ]
+        quiet = "no quiet stretch" if self.quiet_accel_m_s2 is None else f"{self.quiet_accel_m_s2:.4f} m/s^2 at rest"
+        lines += [
+            f"clock: {self.clock_epoch}, time zero {self.t0_ns} ns",
+            f"gravity: {self.gravity_m_s2:.5f} m/s^2 expected, accelerometer {quiet}",
+            f"gaps: {len(self.gaps)}",
+        ]
+        lines += [f"  {g.kind} {g.length_s:.3f} s at {seconds_since(g.start_ns, self.t0_ns):.3f} s" for g in self.gaps]
+        lines.append(f"missing: {', '.join(self.missing) or 'nothing'}")
+        return "\n".join(lines + [f"{finding.level}: {finding}" for finding in self.findings])
+
+
+def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
+    """Look a session over; `gaps` of the inertial stream, where they are known already.
+
+    Streams that will not be used can be left out first: ``inspect(session.replace(magnetometer=None))``.
+    """
+    imu = session.imu
+    usable = imu is not None and len(imu) >= 2
+    if gaps is None:
+        gaps = find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel])) if usable and imu is not None else ()
+    facts = Facts(session, tuple(gaps), quiet_accel(imu) if usable and imu is not None else None)
+    findings = [finding for rule in RULES for finding in rule(facts)]
+    order = {"error": 0, "warning": 1, "info": 2}
+    return Health(
+        streams=tuple(_stream_health(session, name, stream) for name, stream in session.streams().items()),
+        gaps=facts.gaps,
+        clock_epoch=session.clock_epoch,
+        gravity_m_s2=session.gravity,
+        quiet_accel_m_s2=facts.quiet_accel,
+        missing=_missing(session),
+        findings=tuple(sorted(findings, key=lambda finding: order[finding.level])),
+        t0_ns=session.t0_ns,
+    )
+
+
+def _stream_health(session: Session, name: str, stream: Stream) -> StreamHealth:
+    if not len(stream):
+        return StreamHealth(name, 0, np.nan, 0.0, np.nan)
+    start, end = session.seconds(stream.t_ns[[0, -1]])
+    length = float(end - start)
+    return StreamHealth(name, len(stream), float(start), length, (len(stream) - 1) / length if length else np.nan)
+
+
+def _missing(session: Session) -> tuple[str, ...]:
+    there = session.streams()
+    out = [] if "imu" in there else ["imu"]
+    out += [] if any(name in there for name in ABSOLUTE) else [f"absolute sensor ({', '.join(ABSOLUTE)})"]
+    out += ["origin"] if session.origin is None else []
+    out += ["calibration"] if session.calibration is None else []
+    return (*out, *([] if "reference" in there else ["reference"]))
+
+
+RULES: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
+    *streams.RULES,
+    *inertial.RULES,
+    *positions.RULES,
+    *sensors.RULES,
+    streams.dropped,
+)

@@ -1,0 +1,127 @@
+"""What the rules of this room share: a finding, and what several rules need of one session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS, Gap, interpolate
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ABSOLUTE, Imu, Positioned
+
+AIDING = (*ABSOLUTE, "static", "magnetometer", "barometer", "velocity", "wheel")
+JUDGED = 10  # rows from which on a stream is judged
+CHORD_S = 4.0  # s, over which fixes tell a speed
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing noticed. level is ``error`` (cannot be estimated from), ``warning`` (looks wrong) or ``info``."""
+
+    level: str
+    where: str
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+@dataclass(frozen=True)
+class Chords:
+    """Motion between fixes some seconds apart: stamps (n,) of their middle and velocity (n, 3) m/s, nav axes; sigma
+    (n,) m/s of the horizontal velocity."""
+
+    t_ns: NDArray[np.int64]
+    velocity: Floats
+    sigma: Floats
+
+    @property
+    def speed(self) -> Floats:
+        """Horizontal speed (n,) m/s."""
+        return np.asarray(np.linalg.norm(self.velocity[:, :2], axis=1))
+
+    @property
+    def clear(self) -> NDArray[np.bool_]:
+        """Mask (n,) of the chords that are a motion beyond noise."""
+        return np.asarray(self.speed > np.maximum(2.0, 4.0 * self.sigma))
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What several rules need of one session."""
+
+    session: Session
+    gaps: tuple[Gap, ...]
+    quiet_accel: float | None
+
+    @property
+    def imu(self) -> Imu | None:
+        """The inertial stream when it is long enough to be judged."""
+        imu = self.session.imu
+        return imu if imu is not None and len(imu) >= JUDGED else None
+
+    @cached_property
+    def chords(self) -> Chords | None:
+        """Motion that the fixes tell, of GNSS or else of pose fixes; None where they are too few."""
+        stream = self.session.gnss if self.session.gnss is not None else self.session.pose_fixes
+        if stream is None or len(stream) < 3:
+            return None
+        t_ns, p, sigma = stream.t_ns, self.session.nav_position(stream), fix_sigma(stream)
+        other = np.searchsorted(t_ns, t_ns + round(CHORD_S * NS))
+        first = np.flatnonzero(other < len(t_ns))
+        last = other[first]
+        length = (t_ns[last] - t_ns[first]) / NS
+        whole = length < 2.0 * CHORD_S
+        first, last, length = first[whole], last[whole], length[whole]
+        if len(first) < 3:
+            return None
+        middle = t_ns[first] + (t_ns[last] - t_ns[first]) // 2
+        return Chords(middle, (p[last] - p[first]) / length[:, None], np.hypot(sigma[last], sigma[first]) / length)
+
+
+def fix_sigma(stream: Positioned) -> Floats:
+    """Horizontal sigma (n,) m of fixes, 5 m where none is told."""
+    if stream.sigma is None:
+        return np.full(len(stream), 5.0)
+    return np.asarray(np.linalg.norm(np.nan_to_num(stream.sigma[:, :2], nan=5.0), axis=1))
+
+
+def over_chords(chords: Chords, t_ns: NDArray[np.int64], values: Floats) -> Floats:
+    """Means of a sampled signal (n,) or (n, k) over the time of each chord, by its integral."""
+    dt = np.diff(t_ns, prepend=t_ns[0])[:, None] / NS
+    rows = values.reshape(len(t_ns), -1)
+    integral = np.cumsum(rows * dt, axis=0)
+    half = round(0.5 * CHORD_S * NS)
+    begin, end = (np.clip(chords.t_ns + shift, t_ns[0], t_ns[-1]) for shift in (-half, half))
+    whole = interpolate(end, t_ns, integral) - interpolate(begin, t_ns, integral)
+    mean = whole / np.maximum((end - begin) / NS, 1e-9)[:, None]
+    return np.asarray(mean.reshape(-1, *values.shape[1:]))
+
+
+def repeats(values: Floats) -> list[tuple[int, int]]:
+    """First and last row of every stretch in which a signal (n,) or (n, k) repeats itself exactly."""
+    rows = values.reshape(len(values), -1)
+    same = np.concatenate([[False], (rows[1:] == rows[:-1]).all(axis=1), [False]])
+    first, last = np.flatnonzero(~same[:-1] & same[1:]), np.flatnonzero(same[:-1] & ~same[1:])
+    return [(int(i), int(j)) for i, j in zip(first, last, strict=True)]
+
+
+def count_of(n: int, noun: str, plural: str = "s") -> str:
+    """``2 jumps``."""
+    return f"{n} {noun}{'' if n == 1 else plural}"
+
+
+def period(imu: Imu) -> float:
+    """Median step of the stamps, s."""
+    return float(np.median(np.diff(imu.t_ns))) / NS
+
+
+def thinned(imu: Imu) -> Imu:
+    """Every n-th row, to 50 Hz: enough to see a step or a turn."""
+    every = max(1, round(0.02 / period(imu)))
+    return imu.take(slice(None, None, every)) if every > 1 else imu

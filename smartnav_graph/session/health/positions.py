@@ -1,0 +1,211 @@
+"""Positions: jumps, exchanged or wrong units, the zero of heights, and the speeds and attitudes that come with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats, thinned
+from smartnav_graph.session.health.units import odd_speed
+from smartnav_graph.session.streams import Positioned
+
+_MAX_FIX_SPEED = 100.0  # m/s; faster than any car
+_FAR_M = 50_000.0  # two sensors of one session
+_FROZEN_FIXES_S = 10.0
+_HEIGHTS_M = (-500.0, 9000.0)  # of the Earth's land
+_GEOID_M = (8.0, 110.0)  # offsets of two heights that look like the geoid
+_ATTITUDE_PAIRS, _LEAST_PAIRS, _ATTITUDE_PAIR_S = 100, 5, 15.0
+
+
+def _jumps(facts: Facts) -> Iterator[Finding]:
+    for name in ("gnss", "pose_fixes"):
+        stream = getattr(facts.session, name)
+        if stream is None or len(stream) < 2:
+            continue
+        position = facts.session.nav_position(stream)
+        # a jump must stand out of the noise of both fixes, or 10 Hz fixes would always jump
+        sigma = np.linalg.norm(np.nan_to_num(stream.sigma, nan=5.0), axis=1) if stream.sigma is not None else 5.0
+        noise = 4.0 * np.broadcast_to(sigma, len(position))
+        allowed = _MAX_FIX_SPEED * np.diff(stream.t_ns) / NS + np.hypot(noise[1:], noise[:-1])
+        jump = np.linalg.norm(np.diff(position, axis=0), axis=1) > allowed
+        if jump.any():
+            at = float(facts.session.seconds(stream.t_ns[1:][jump][0]))
+            text = f"{count_of(int(jump.sum()), 'jump')} faster than {_MAX_FIX_SPEED:g} m/s, the first at {at:.3f} s"
+            yield Finding("warning", name, text, "keep a robust loss on, or remove the outliers")
+
+
+def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
+    for name, stream in facts.session.streams().items():
+        if not isinstance(stream, Positioned):
+            continue
+        if stream.sigma is None:
+            yield Finding("info", name, "has no sigma columns", "the default of the device class will be used")
+        elif bad := int(np.isnan(stream.sigma).any(axis=1).sum()):
+            text = f"{bad} of {len(stream)} rows have no sigma"
+            yield Finding("info", name, text, "the default of the device class will be used there")
+        if facts.session.mount(name).frame == "msl":
+            yield Finding("info", name, "heights count from mean sea level, not from the ellipsoid")
+
+
+def _exchanged(facts: Facts) -> Iterator[Finding]:
+    """Latitude and longitude against those of the other streams and of the origin; radians."""
+    centres = {name: np.median(lla, axis=0) for name, lla in _geodetic(facts).items()}
+    origin = facts.session.origin
+    if origin is not None:
+        centres["origin"] = np.array([origin.lat_deg, origin.lon_deg, origin.height_m])
+    names = list(centres)
+    for i, name in enumerate(names):
+        for other in names[i + 1 :]:
+            away, turned = (_degrees_apart(centres[name][order], centres[other][:2]) for order in ([0, 1], [1, 0]))
+            if np.radians(away) * 6.4e6 > _FAR_M:
+                apart = f"lies {np.radians(away) * 6.4e3:.0f} km from {other}"
+                if turned < 0.5:
+                    text = f"{apart}, and near it with latitude and longitude exchanged"
+                    yield Finding("warning", name, text, f"exchange lat_deg and lon_deg of {name} or of {other}")
+                else:
+                    yield Finding("warning", name, apart, "check lat_deg, lon_deg and [origin]")
+    for name, lla in _geodetic(facts).items():
+        if np.abs(lla[:, 0]).max() < np.pi / 2 and np.abs(lla[:, 1]).max() < np.pi:
+            text = "latitudes and longitudes are all within pi of zero, where there is no land: they look like radians"
+            yield Finding("warning", name, text, "give degrees")
+
+
+def _geodetic(facts: Facts) -> dict[str, Floats]:
+    """Latitude and longitude (deg) and height (n, 3) m of the streams that tell them."""
+    return {name: s.lla for name, s in facts.session.absolute().items() if len(s) and s.lla is not None}
+
+
+def _degrees_apart(one: Floats, other: Floats) -> float:
+    """Angle between two (lat, lon) in degrees, good enough to tell kilometres from thousands of them."""
+    if abs(one[0]) > 90.0:
+        return 180.0
+    lon = (one[1] - other[1] + 180.0) % 360.0 - 180.0
+    return float(np.hypot(one[0] - other[0], lon * np.cos(np.radians(other[0]))))
+
+
+def _heights(facts: Facts) -> Iterator[Finding]:
+    for name, lla in _geodetic(facts).items():
+        height = lla[:, 2]
+        if len(height) >= JUDGED and not height.any():
+            yield Finding(
+                "warning", name, "height_m is zero in all rows", "the log holds no heights; give large sigma_u_m"
+            )
+        elif not _HEIGHTS_M[0] < float(np.median(height)) < _HEIGHTS_M[1]:
+            text = f"median height {np.median(height):.6g} m, where land lies between -430 and 8849 m"
+            yield Finding("warning", name, text, "give metres above the ellipsoid")
+    gnss, control = facts.session.gnss, facts.session.control
+    if gnss is None or control is None or len(gnss) < 2:
+        return
+    t_ns = control.t_ns[(control.t_ns >= gnss.t_ns[0]) & (control.t_ns <= gnss.t_ns[-1])]
+    if not len(t_ns):
+        return
+    points = interpolate(t_ns, control.t_ns, facts.session.nav_position(control)[:, 2])
+    off = interpolate(t_ns, gnss.t_ns, facts.session.nav_position(gnss)[:, 2]) - points
+    middle, spread = float(np.median(off)), float(np.median(np.abs(off - np.median(off)))) if len(off) > 2 else 5.0
+    frames = {facts.session.mount(name).frame for name in ("gnss", "control")}
+    if _GEOID_M[0] < abs(middle) < _GEOID_M[1] and abs(middle) > 4.0 * spread and len(frames) == 1:
+        text = f"heights lie {middle:+.1f} m off those of the control points, as the geoid does"
+        yield Finding(
+            "warning", "gnss", text, 'one of them counts from sea level: say so by frame = "msl" in [sensors]'
+        )
+
+
+def _frozen(facts: Facts) -> Iterator[Finding]:
+    """A fix repeated while the device moves."""
+    for name in ("gnss", "pose_fixes"):
+        stream = getattr(facts.session, name)
+        if stream is None or facts.imu is None or len(stream) < JUDGED:
+            continue
+        position = facts.session.nav_position(stream)
+        for first, last in repeats(position):
+            seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS
+            if last - first >= JUDGED // 2 and seconds >= _FROZEN_FIXES_S and _moves(facts, stream.t_ns[[first, last]]):
+                at = float(facts.session.seconds(stream.t_ns[first]))
+                text = f"repeats one position for {seconds:.0f} s from {at:.1f} s on, while the inertial data move"
+                if last - first < len(stream) - 1:
+                    yield Finding("warning", name, text, "the receiver hung there; take the repeated rows out")
+
+
+def _moves(facts: Facts, span: NDArray[np.int64]) -> bool:
+    """Whether rate or force of a stretch scatter more than at rest."""
+    imu = facts.imu
+    assert imu is not None
+    inside = (imu.t_ns >= span[0]) & (imu.t_ns <= span[1])
+    if inside.sum() < JUDGED:
+        return False
+    return bool(imu.gyro[inside].std(axis=0).max() > 0.05 or imu.accel[inside].std(axis=0).max() > 0.4)
+
+
+def _velocities(facts: Facts) -> Iterator[Finding]:
+    """Velocities that come with the fixes against the motion between them."""
+    gnss, chords = facts.session.gnss, facts.chords
+    if gnss is None or gnss.velocity is None or chords is None:
+        return
+    known = np.isfinite(gnss.velocity).all(axis=1)
+    if known.sum() < JUDGED or chords.clear.sum() < JUDGED:
+        return
+    told = over_chords(chords, gnss.t_ns[known], gnss.velocity[known])[chords.clear]
+    moved = chords.velocity[chords.clear]
+    yield from odd_speed("gnss", "velocity", np.linalg.norm(told[:, :2], axis=1), chords.speed[chords.clear])
+    length = np.linalg.norm(told[:, :2], axis=1) * np.linalg.norm(moved[:, :2], axis=1)
+    along = float(np.median((told[:, :2] * moved[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
+    turned = float(np.median((told[:, [1, 0]] * moved[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
+    if along < -0.7:
+        yield Finding("warning", "gnss", "velocity points against the motion of the fixes", "flip its sign")
+    elif turned > 0.9 and along < 0.7:
+        yield Finding("warning", "gnss", "velocity fits the fixes with east and north exchanged", "exchange ve and vn")
+
+
+def _attitudes(facts: Facts) -> Iterator[Finding]:
+    """Attitudes of pose fixes against the gyro between them and the accelerometer."""
+    fixes, imu = facts.session.pose_fixes, facts.imu
+    if fixes is None or fixes.quat is None or imu is None:
+        return
+    quat = fixes.quat[np.isfinite(fixes.quat).all(axis=1)]
+    t_ns = fixes.t_ns[np.isfinite(fixes.quat).all(axis=1)]
+    pairs = np.flatnonzero((np.diff(t_ns) > 0) & (np.diff(t_ns) < _ATTITUDE_PAIR_S * NS) & (t_ns[:-1] >= imu.t_ns[0]))
+    pairs = pairs[t_ns[pairs + 1] <= imu.t_ns[-1]]
+    if len(pairs) < _LEAST_PAIRS:
+        return
+    pairs = pairs[np.linspace(0, len(pairs) - 1, min(_ATTITUDE_PAIRS, len(pairs))).astype(int)]
+    slow = thinned(imu)
+    turned = [_turn(slow.t_ns, slow.gyro, t_ns[k], t_ns[k + 1]) for k in pairs]
+    readings = {
+        "as they stand": quat[:, [1, 2, 3, 0]],
+        "with qw last": quat,
+        "inverted": quat[:, [1, 2, 3, 0]] * [-1, -1, -1, 1],
+    }
+    off = {}
+    for name, xyzw in readings.items():
+        R = Rotation.from_quat(xyzw)
+        differs = (R[pairs].inv() * R[pairs + 1]).inv() * Rotation.concatenate(turned)
+        off[name] = float(np.degrees(np.quantile(differs.magnitude(), 0.75)))
+    best = min(off, key=lambda name: off[name])
+    if best != "as they stand" and off["as they stand"] > 20.0 and off[best] < 0.25 * off["as they stand"]:
+        text = f"attitudes turn {off['as they stand']:.0f} deg otherwise than gyro, {off[best]:.1f} deg if read {best}"
+        yield Finding("warning", "pose_fixes", text, "give qw, qx, qy, qz of nav_R_body")
+        return
+    up = interpolate(t_ns, slow.t_ns, slow.accel)
+    vertical = float(np.median(Rotation.from_quat(readings["as they stand"]).apply(up)[:, 2]))
+    if vertical < -0.5 * facts.session.gravity:
+        text = f"attitudes turn specific force to {vertical:.1f} m/s^2 along up: they look like north, east, down"
+        yield Finding("warning", "pose_fixes", text, "give nav_R_body with nav = east, north, up")
+
+
+def _turn(t_ns: NDArray[np.int64], gyro: Floats, begin: int, end: int) -> Rotation:
+    """Rotation of the body from `begin` to `end` by its rates."""
+    inside = t_ns[(t_ns > begin) & (t_ns < end)]
+    edges = np.concatenate([[begin], inside, [end]])
+    rate = interpolate(edges, t_ns, gyro)
+    turn = Rotation.identity()
+    for w in 0.5 * (rate[1:] + rate[:-1]) * (np.diff(edges) / NS)[:, None]:
+        turn = turn * Rotation.from_rotvec(w)
+    return turn
+
+
+RULES = (_jumps, _exchanged, _heights, _frozen, _velocities, _attitudes, _sigmas_and_heights)

@@ -1,0 +1,190 @@
+"""Magnetometer, barometer, thermometer, speeds of the body, standstills: units, signs, what cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats
+from smartnav_graph.session.health.units import odd_speed
+
+_EARTH_UT = (22.0, 67.0)  # of the geomagnetic field at the ground
+_FIELD_UNITS = {1e-6: "tesla", 1e-3: "millitesla", 1e-2: "gauss", 1e1: "milligauss", 1e3: "nanotesla"}
+_PRESSURE_UNITS = {100.0: "Pa", 0.1: "kPa", 0.02953: "inHg", 0.750: "mmHg", 0.0145: "psi", 0.000987: "atm"}
+_PRESSURE_HPA = (300.0, 1100.0)
+_WEATHER = 0.06  # share of the pressure
+_MAX_SPEED = 100.0  # m/s
+_FROZEN_FIELD_S = 10.0
+_ALIKE = 0.4  # correlation that is no chance
+_TURNS = 0.3  # rad/s, scatter of the rate of a device that is no rest
+
+
+def _field(facts: Facts) -> Iterator[Finding]:
+    stream = facts.session.magnetometer
+    if stream is None or len(stream) < JUDGED or (stream.field_ut == stream.field_ut[0]).all():
+        return
+    size = float(np.median(np.linalg.norm(stream.field_ut, axis=1)))
+    expected = facts.session.magnetic_field_ut
+    low, high = _EARTH_UT
+    near = f"{np.linalg.norm(expected):.0f} uT here" if expected is not None else f"{low:.0f} to {high:.0f} uT on Earth"
+    for factor, unit in _FIELD_UNITS.items():
+        if low <= size / factor <= high:
+            yield Finding(
+                "warning",
+                "magnetometer",
+                f"median |field| {size:.3g} uT, expected {near}: it looks like {unit}",
+                "give uT",
+            )
+            return
+    if not 0.3 * low < size < 3.0 * high:
+        text = f"median |field| {size:.4g} uT, expected {near}"
+        yield Finding("warning", "magnetometer", text, "calibrate its hard iron, or check the unit")
+    yield from _field_direction(facts, size)
+    for first, last in repeats(stream.field_ut):
+        seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS
+        if seconds >= _FROZEN_FIELD_S and last - first >= JUDGED:
+            at = float(facts.session.seconds(stream.t_ns[first]))
+            yield Finding(
+                "warning", "magnetometer", f"repeats one reading for {seconds:.0f} s from {at:.1f} s on", "it hung"
+            )
+            return
+
+
+def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
+    """The sign by the dip of the field under gravity, the axes by how it turns in the body as gyro does."""
+    stream, imu, expected = facts.session.magnetometer, facts.imu, facts.session.magnetic_field_ut
+    if stream is None or imu is None:
+        return
+    inside = (stream.t_ns >= imu.t_ns[0]) & (stream.t_ns <= imu.t_ns[-1])
+    field, t_ns = stream.field_ut[inside], stream.t_ns[inside]
+    if len(field) < JUDGED:
+        return
+    up = interpolate(t_ns, imu.t_ns, imu.accel)
+    sine = np.median((field * up).sum(axis=1) / np.linalg.norm(field, axis=1) / np.linalg.norm(up, axis=1))
+    if expected is not None and abs(size / np.linalg.norm(expected) - 1.0) < 0.3:
+        wanted = float(expected[2] / np.linalg.norm(expected))
+        if abs(wanted) > 0.5 and abs(sine + wanted) < 0.2:
+            found, there = np.degrees(np.arcsin(sine)), np.degrees(np.arcsin(wanted))
+            text = f"field points {found:+.0f} deg from the horizon, expected {there:+.0f}"
+            yield Finding("warning", "magnetometer", f"{text}: its sign is wrong", "flip the sign of all axes")
+            return
+    yield from _field_turns(facts, t_ns, field)
+
+
+def _field_turns(facts: Facts, t_ns: NDArray[np.int64], field: Floats) -> Iterator[Finding]:
+    """Changes of the field over a second against those that gyro foretells, B(t + dt) = Exp(-w dt) B(t)."""
+    imu = facts.imu
+    assert imu is not None
+    every = max(1, round(NS / float(np.median(np.diff(t_ns)))))
+    field, t_ns = uniform_filter1d(field, every, axis=0)[::every], t_ns[::every]
+    length = (t_ns[1:] - t_ns[:-1]) / NS
+    whole = length < 2.0
+    if whole.sum() < JUDGED:
+        return
+    angle = np.cumsum(imu.gyro * np.diff(imu.t_ns, prepend=imu.t_ns[0])[:, None] / NS, axis=0)
+    turn = np.diff(interpolate(t_ns, imu.t_ns, angle), axis=0)[whole]
+    change = np.diff(field, axis=0)[whole]
+    foretold = Rotation.from_rotvec(-turn).apply(field[:-1][whole]) - field[:-1][whole]
+    power = float((foretold**2).sum())
+    slope = float((change * foretold).sum()) / max(power, 1e-12)
+    alike = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
+    if alike < -_ALIKE:
+        text = "field turns against gyro: its axes are mirrored or exchanged, or gyro has the wrong sign"
+        yield Finding("warning", "magnetometer", text, "give the field in body axes, right-handed")
+    elif alike > _ALIKE and 30.0 < slope < 90.0:
+        text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
+        yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
+
+
+def _pressure(facts: Facts) -> Iterator[Finding]:
+    stream = facts.session.barometer
+    if stream is None or len(stream) < JUDGED:
+        return
+    median, low, high = float(np.median(stream.pressure_hpa)), *_PRESSURE_HPA
+    height = facts.session.origin.height_m if facts.session.origin is not None else None
+    # standard atmosphere (ISO 2533)
+    expected = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588 if height is not None and height < 11_000 else None
+    wanted = f"about {expected:.0f} hPa at {height:.0f} m" if expected is not None else f"{low:.0f} to {high:.0f} hPa"
+    right = low <= median <= high and (expected is None or abs(median / expected - 1.0) < _WEATHER)
+    if not right:
+        centre = expected if expected is not None else 980.0
+        share = _WEATHER if expected is not None else 0.25
+        unit = next((name for f, name in _PRESSURE_UNITS.items() if abs(median / f / centre - 1.0) < share), None)
+        looks = f": it looks like {unit}" if unit else ""
+        text = f"median pressure {median:.5g} hPa, expected {wanted}{looks}"
+        yield Finding("warning", "barometer", text, "give hPa" if unit else "check unit and [origin] height_m")
+
+
+def _temperature(facts: Facts) -> Iterator[Finding]:
+    stream = facts.session.temperature
+    if stream is None or not len(stream):
+        return
+    median = float(np.median(stream.temperature_c))
+    if not -60.0 < median < 110.0:
+        looks = ": it looks like kelvin" if 230.0 < median < 370.0 else ""
+        yield Finding("warning", "temperature", f"median {median:.4g} deg C{looks}", "give degrees Celsius")
+
+
+def _speeds(facts: Facts) -> Iterator[Finding]:
+    """Wheel speed and body velocity against the motion of the fixes."""
+    forward = frames.axis_vector(facts.session.device.forward)
+    wheel, velocity = facts.session.wheel, facts.session.velocity
+    rolls = facts.session.device.vehicle in ("car", "trolley")
+    if wheel is not None and len(wheel) >= JUDGED:
+        yield from _speed(facts, "wheel", "speed", wheel.t_ns, wheel.speed, wheel.speed)
+    if velocity is not None and len(velocity) >= JUDGED:
+        along = velocity.velocity @ forward
+        size = np.linalg.norm(velocity.velocity, axis=1)
+        yield from _speed(facts, "velocity", "velocity", velocity.t_ns, size, along if rolls else size)
+
+
+def _speed(
+    facts: Facts, where: str, what: str, t_ns: NDArray[np.int64], size: Floats, along: Floats
+) -> Iterator[Finding]:
+    chords = facts.chords
+    fastest = float(np.quantile(np.abs(size), 0.99))
+    inside = None if chords is None else chords.clear & (chords.t_ns >= t_ns[0]) & (chords.t_ns <= t_ns[-1])
+    if chords is None or inside is None or inside.sum() < JUDGED:
+        if fastest > _MAX_SPEED:
+            yield Finding(
+                "warning", where, f"99 % quantile of {what} is {fastest:.4g} m/s, faster than any car", "give m/s"
+            )
+        return
+    mean, way = (over_chords(chords, t_ns, values)[inside] for values in (np.abs(size), along))
+    known = chords.speed[inside]
+    yield from odd_speed(where, what, mean, known)
+    if float(np.median(way / known)) < -0.3:
+        yield Finding(
+            "warning", where, f"{what} is backwards while the fixes move", "flip its sign, or correct [device] forward"
+        )
+    elif float(np.median(mean / known)) < 0.05:
+        yield Finding("warning", where, f"{what} is zero while the fixes move", f"remove {where}, or import it again")
+
+
+def _standstills(facts: Facts) -> Iterator[Finding]:
+    """Listed standstills in which the device or the fixes move."""
+    stream, imu, chords = facts.session.static, facts.imu, facts.chords
+    if stream is None or imu is None:
+        return
+    moving = 0
+    for begin, end in zip(stream.t_ns, stream.t_end_ns, strict=True):
+        inside = (imu.t_ns >= begin) & (imu.t_ns <= end)
+        turned = inside.sum() >= JUDGED and float(imu.gyro[inside].std(axis=0).max()) > _TURNS
+        within = (
+            np.zeros(0, dtype=bool) if chords is None else (chords.t_ns > begin + 2 * NS) & (chords.t_ns < end - 2 * NS)
+        )
+        went = chords is not None and within.any() and bool(np.median(chords.clear[within]) > 0.5)
+        moving += bool(turned or went)
+    if moving:
+        text = f"the device moves in {count_of(moving, 'listed standstill')} of {len(stream)}"
+        yield Finding("warning", "static", text, "check their stamps; a false standstill bends the trajectory")
+
+
+RULES = (_field, _pressure, _temperature, _speeds, _standstills)

@@ -1,0 +1,102 @@
+"""Any stream: rows, clock, overlap with the inertial stream, values that never change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.health.facts import AIDING, JUDGED, Facts, Finding, period
+from smartnav_graph.session.streams import ABSOLUTE, StaticPeriod
+
+_UNIX_FROM, _UNIX_TO = 631_152_000 * NS, 4_102_444_800 * NS  # 1990 to 2100
+
+
+def _rows(facts: Facts) -> Iterator[Finding]:
+    session = facts.session
+    for name, stream in session.streams().items():
+        if not len(stream):
+            yield Finding("error", name, "has no rows", "remove the stream, or import the log again")
+    if session.imu is None:
+        yield Finding("error", "imu", "there is no inertial stream", "import one; everything else hangs on it")
+    elif 0 < len(session.imu) < 2:
+        yield Finding("error", "imu", "has one row only", "import at least two")
+    elif len(session.imu) and (length := (session.imu.t_ns[-1] - session.imu.t_ns[0]) / NS) < 1.0:
+        yield Finding("warning", "imu", f"lasts {length:.3f} s only", "check the unit of its time stamps")
+    if not session.absolute():
+        text = f"no absolute sensor ({', '.join(ABSOLUTE)})"
+        yield Finding("warning", "session", text, "start from a standstill or with --initial for dead reckoning")
+
+
+def dropped(facts: Facts) -> Iterator[Finding]:
+    for name, counts in facts.session.dropped.items():
+        yield Finding("info", name, ", ".join(f"{count} {reason}" for reason, count in counts.items()))
+
+
+def _clock(facts: Facts) -> Iterator[Finding]:
+    session = facts.session
+    if session.clock_epoch == "unix" and not _UNIX_FROM <= session.t0_ns <= _UNIX_TO:
+        text = f"epoch is unix, but time zero is {session.t0_ns} ns, outside 1990 to 2100"
+        yield Finding("warning", "session.toml [clock]", text, "check the unit of t_ns, or set another epoch")
+    if facts.imu is not None and not 1.0 <= (rate := 1.0 / period(facts.imu)) <= 20_000.0:
+        text = f"median rate {rate:.4g} Hz is outside 1 Hz to 20 kHz"
+        yield Finding("warning", "imu", text, "t_ns counts nanoseconds; check the unit of the time stamps")
+
+
+def _constant(facts: Facts) -> Iterator[Finding]:
+    s = facts.session
+    # a phone at rest may repeat one fix, and pressure is quantised: possible, but worth a word
+    columns: list[tuple[str, str, str, Floats | None]] = [
+        ("error", "imu", "gyro", s.imu.gyro if s.imu else None),
+        ("error", "imu", "accel", s.imu.accel if s.imu else None),
+        ("error", "magnetometer", "field", s.magnetometer.field_ut if s.magnetometer else None),
+        ("warning", "gnss", "position", s.nav_position(s.gnss) if s.gnss else None),
+        ("warning", "pose_fixes", "position", s.nav_position(s.pose_fixes) if s.pose_fixes else None),
+        ("warning", "barometer", "pressure", s.barometer.pressure_hpa if s.barometer else None),
+        ("warning", "velocity", "velocity", s.velocity.velocity if s.velocity else None),
+        ("warning", "wheel", "speed", s.wheel.speed if s.wheel else None),
+        ("warning", "temperature", "temperature", s.temperature.temperature_c if s.temperature else None),
+    ]
+    for level, stream, what, values in columns:
+        if values is not None and len(values) >= JUDGED and (values == values[0]).all() and not _resting(facts, stream):
+            text = f"{what} is {' '.join(f'{x:g}' for x in np.atleast_1d(values[0]))} in all {len(values)} rows"
+            yield Finding(level, stream, text, f"if the sensor did not record, remove {stream} or import it again")
+
+
+def _resting(facts: Facts, stream: str) -> bool:
+    """Whether a speed that is always zero may be true: the fixes do not move either."""
+    if stream not in ("velocity", "wheel"):
+        return False
+    values = getattr(facts.session, stream)
+    zero = not np.any(values.velocity if stream == "velocity" else values.speed)
+    return zero and (facts.chords is None or not facts.chords.clear.any())
+
+
+def _overlap(facts: Facts) -> Iterator[Finding]:
+    imu = facts.session.imu
+    if imu is None or len(imu) < 2:
+        return
+    first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
+    inside: dict[str, int] = {}
+    for name in AIDING:
+        stream = getattr(facts.session, name)
+        if stream is None or not len(stream):
+            continue
+        ends = stream.t_end_ns if isinstance(stream, StaticPeriod) else stream.t_ns
+        count = inside[name] = int(((ends >= first) & (stream.t_ns <= last)).sum())
+        if count < len(stream):
+            begin, end = facts.session.seconds([stream.t_ns[0], ends[-1]])
+            text = (
+                f"{len(stream) - count} of {len(stream)} rows lie outside the imu's span "
+                f"0 to {(last - first) / NS:.3f} s (the stream spans {begin:.3f} to {end:.3f} s)"
+            )
+            yield Finding("warning", name, text, "they are not used; check that both use one clock")
+    absolute = [name for name in inside if name in ABSOLUTE]
+    if absolute and not any(inside[name] for name in absolute):
+        text = f"no row of {', '.join(absolute)} lies inside the imu's span 0 to {(last - first) / NS:.3f} s"
+        yield Finding("error", "session", text, "bring the stamps of both to one clock")
+
+
+RULES = (_rows, _clock, _constant, _overlap)

@@ -1,0 +1,28 @@
+"""Speeds in another unit, told from a speed that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.session.health.facts import JUDGED, Finding
+
+_SPEEDS = {3.6: "km/h", 1.944: "knots", 2.237: "mph", 3.281: "ft/s", 100.0: "cm/s", 1000.0: "mm/s"}
+_NEAR = 0.06  # of a unit's factor
+_ODD = 1.3  # a factor that no slip or tyre explains
+
+
+def odd_speed(where: str, what: str, told: Floats, known: Floats) -> Iterator[Finding]:
+    """Speeds (n,) told by a sensor against those known from elsewhere (n,) m/s."""
+    if len(told) < JUDGED:
+        return
+    factor = float(np.median(told / known))
+    scatter = float(np.median(np.abs(told / known - factor)))
+    if 1.0 / _ODD < factor < _ODD or scatter > 0.3 * abs(factor):
+        return
+    unit = next((name for f, name in _SPEEDS.items() if abs(factor / f - 1.0) < _NEAR), None)
+    looks = f": it looks like {unit}" if unit else ""
+    text = f"{what} is {factor:.3g} times the speed of the fixes{looks}"
+    yield Finding("warning", where, text, f"divide {what} by {factor:.4g}" if unit is None else "give m/s")
