@@ -55,7 +55,7 @@ FLOOR, UNKNOWN = 3.0, 30.0
 
 @dataclass(frozen=True)
 class Bridge:
-    """Noise densities (3,) accel m/s^2/sqrt(Hz) and gyro rad/s/sqrt(Hz) across a gap; expected (2, 6) : mean and slope of
+    """Noise densities (3,) accel m/s^2/sqrt(Hz), gyro rad/s/sqrt(Hz) across a gap; expected (2, 6) : mean and slope of
     force m/s^2 and rate rad/s over it, None where nothing is known and a straight line has to do; wander (6, 6) :
     the diffusion q a second by which force m/s^2 and rate rad/s stray from that."""
 

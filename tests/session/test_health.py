@@ -300,7 +300,7 @@ def test_text_names_everything():
         assert part in text
 
 
-DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
+DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).parents[3] / "shared" / "datasets"))
 real = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no real recordings at {DATASETS} (SMARTNAV_DATASETS)")
 
 
