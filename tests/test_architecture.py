@@ -15,7 +15,7 @@ ORDER = (
     *("evaluation", "output", "cli", "__main__"),
 )
 API = "__init__"  # it alone may import everything
-HEAVY = {"rerun", "cv2", "pycolmap", "evo", "pandas", "matplotlib"}
+HEAVY = {"rerun", "cv2", "pycolmap", "pandas", "matplotlib"}
 
 FOLDERS, FILE_LINES, FUNCTION_LINES = 13, 400, 60
 ANY = 406  # uses of typing.Any in the package; lower it whenever the count falls

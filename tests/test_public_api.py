@@ -24,7 +24,7 @@ def test_smoothing_needs_neither_pictures_nor_viewer_nor_tables():
     code = "import smartnav_graph as sn\nsn.smooth(sn.simulate('figure-eight-60s'), end_s=5.0, initial='0,0,0,0,3,30')"
     there = loaded_after(code)
     assert "gtsam" in there
-    assert not {"cv2", "pycolmap", "rerun", "pandas", "matplotlib", "evo"} & there
+    assert not {"cv2", "pycolmap", "rerun", "pandas", "matplotlib"} & there
 
 
 def test_help_is_as_light():

@@ -1,6 +1,7 @@
-"""Rotations row by row: products, exponential map, skew matrices and the Jacobians of SO(3).
+"""Rotations row by row: products, exponential map, skew matrices and the Jacobians of SO(3); the best rotation.
 
-Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III.
+Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III; Umeyama (1991),
+Least-squares estimation of transformation parameters between two point patterns, IEEE PAMI 13(4), for `best_rotation`.
 """
 
 from __future__ import annotations
@@ -46,3 +47,14 @@ def right_jacobian(theta: Floats) -> Floats:
     two = np.where(square < 1e-6, 1.0 / 6.0, (angle - np.sin(angle)) / angle**3)
     cross = skew(theta)
     return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
+
+
+def best_rotation(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """The rotation R (3, 3) that minimises sum |y - R x|^2 over points x, y (n, 3), each minus its mean.
+
+    The singular values (3,) of sum y x^T stand beside it, the last with the sign of det: the least squares scale of
+    R x is their sum over sum |x|^2. Where the second is zero, the points lie on a line and R is not determined.
+    """
+    u, d, vt = np.linalg.svd((y - y.mean(axis=0)).T @ (x - x.mean(axis=0)))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])  # no reflection
+    return np.asarray(u @ np.diag(sign) @ vt), np.asarray(d * sign)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.so3 import best_rotation
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
@@ -20,6 +21,7 @@ from smartnav_graph.session.streams import Reference
 METHODS = ("none", "yaw", "se3", "sim3")
 
 _SEARCH_ROWS = 2000  # reference rows the search for a time offset looks at; more change it by less than a millisecond
+_RANK = 1e-13  # second singular value over the first, below which positions on a line differ by rounding alone
 _CANDIDATES = 5  # peaks of the speed correlation that are refined
 
 
@@ -168,7 +170,7 @@ def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
 
     ``yaw`` turns about the vertical only: psi = atan2(sum x_e y_n - x_n y_e, sum x_e y_e + x_n y_n) over centred
     horizontal positions x (estimate) and y (reference). ``se3`` and ``sim3`` follow Umeyama (1991, IEEE PAMI 13,
-    376-380) as implemented in evo.
+    376-380).
 
     Raises
     ------
@@ -181,13 +183,12 @@ def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
         return _fit_yaw(estimate, truth)
     if method not in METHODS:
         raise SessionError("--align", f"{method!r}", f"one of {', '.join(METHODS)}")
-    from evo.core.geometry import GeometryException, umeyama_alignment
-
-    try:
-        R, t, scale = umeyama_alignment(estimate.T, truth.T, with_scale=method == "sim3")
-    except GeometryException as error:
-        raise _degenerate(method, len(truth), "positions that span a plane") from error
-    return Alignment(np.asarray(R), np.asarray(t), float(scale))
+    R, singular = best_rotation(estimate, truth)
+    if not singular[1] > _RANK * singular[0]:
+        raise _degenerate(method, len(truth), "positions that span a plane")
+    centre = estimate.mean(axis=0)
+    scale = float(singular.sum() / ((estimate - centre) ** 2).sum()) if method == "sim3" else 1.0
+    return Alignment(R, truth.mean(axis=0) - scale * R @ centre, scale)
 
 
 def _fit_yaw(estimate: Floats, truth: Floats) -> Alignment:

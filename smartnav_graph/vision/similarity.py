@@ -15,6 +15,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SolverError
+from smartnav_graph.core.so3 import best_rotation
 
 LEAST = 4  # positions: seven unknowns, and something to judge them by
 LEAST_WIDTH = 0.01  # of the length: what is narrower is a line
@@ -59,7 +60,7 @@ def align(map_t_cam: Floats, map_t_lever: Floats, nav_t_body: Floats, where: str
     scale = _spread(nav_t_body) / max(_spread(map_t_cam), np.finfo(float).tiny)
     R = np.eye(3)
     for _ in range(TURNS):
-        R = _turn(scale * map_t_cam - map_t_lever, nav_t_body)
+        R, _ = best_rotation(scale * map_t_cam - map_t_lever, nav_t_body)
         centred = map_t_cam - map_t_cam.mean(axis=0)
         before, scale = scale, float(np.sum(centred * (nav_t_body @ R + map_t_lever)) / np.sum(centred**2))
         if abs(scale - before) <= SETTLED * abs(scale):
@@ -74,12 +75,6 @@ def align(map_t_cam: Floats, map_t_lever: Floats, nav_t_body: Floats, where: str
 
 def _spread(x: Floats) -> float:
     return float(np.linalg.norm(x - x.mean(axis=0)))
-
-
-def _turn(x: Floats, y: Floats) -> Floats:
-    """Rotation (3, 3) that lays x on y, both centred."""
-    u, _, vt = np.linalg.svd((y - y.mean(axis=0)).T @ (x - x.mean(axis=0)))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
 
 
 def _turn_sigma(centred: Floats, sigma: float, where: str) -> Floats:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from evo.core.geometry import umeyama_alignment
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import interpolate
+from smartnav_graph.evaluation.align import fit
 from smartnav_graph.readers.reference import load_reference, load_transform
 from smartnav_graph.session.session import Session, save
 from smartnav_graph.session.streams import Reference
@@ -170,9 +170,9 @@ def test_kitti_body_positions_are_those_of_the_wheel(dataset):
 
     def misfit(positions):
         at = interpolate(t_ns[inside], reference.t_ns, positions)
-        R, t, scale = umeyama_alignment(at.T, fixes.enu[inside].T, with_scale=True)
-        assert scale == pytest.approx(0.998, abs=2e-3)
-        residual = fixes.enu[inside] - (scale * at @ R.T + t)
+        found = fit("sim3", at, fixes.enu[inside])
+        assert found.scale == pytest.approx(0.998, abs=2e-3)
+        residual = fixes.enu[inside] - found.position(at)
         return np.sqrt((residual**2).sum(axis=1).mean())
 
     assert misfit(reference.enu) < 0.05  # m: 10 Hz poses interpolated linearly at 8 m/s in bends
