@@ -13,12 +13,12 @@ from typing import Any
 
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.problem import Problem
-from smartnav_graph.estimate.reweight.image_pair_outliers import lost, settled
+from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs, lost
 from smartnav_graph.estimate.reweight.update import BENT_M, WIDE_M, extra_passes, update_pass_state, widen_robust_scale
 from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.update import Builder, build_update, one_of
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers import Smoother, incremental
@@ -60,11 +60,11 @@ def one_pass(
             smoother.update(build_update(window, smoother.latest(), builders, pass_state, problem.session.t0_ns))
 
 
-def _settled_pairs(smoother: Batch, builders: Sequence[Builder], pass_state: PassState) -> PassState:
+def _check_pairs_again(smoother: Batch, builders: Sequence[Builder], pass_state: PassState) -> PassState:
     """Judge image pairs again and again at what they lead to, all else as it is; the memory with what was found."""
     pairs = one_of(builders, CoplanarityBuilder)
-    while pairs is not None and 0 < pass_state.settled.get(pairs.name, 0) < COMPRESSED:
-        pass_state = settled(builders, smoother.provisional(), pass_state)
+    while pairs is not None and 0 < pass_state.tests(pairs.name) < COMPRESSED:
+        pass_state = check_pairs(builders, smoother.provisional(), pass_state)
         smoother.renewed(partial(pairs.renew, pass_state=pass_state))
     return pass_state
 
@@ -105,7 +105,7 @@ def solve_passes(
     most = problem.config.run.passes + extra_passes(problem.builders)
     precision = FIRST if coarse_start else problem.config.solve
     builders, first, diverged = [prior, *problem.builders], initial_values, False
-    if pass_state.phase == "robust" and not coarse_start:
+    if pass_state.phase is Phase.ROBUST and not coarse_start:
         pass_state = widen_robust_scale(problem.builders, pass_state)
     for count in itertools.count(1):
         most += pass_state.narrowing
@@ -113,7 +113,7 @@ def solve_passes(
         smoother = Batch(problem.config.batch, precision, initial_values, problem.session.t0_ns, coarse_start, first_s)
         one_pass(smoother, watched(stage, windows, progress), builders, pass_state, problem)
         progress(f"{stage}, solving", 0, 0)
-        pass_state = _settled_pairs(smoother, problem.builders, pass_state)
+        pass_state = _check_pairs_again(smoother, problem.builders, pass_state)
         estimate = smoother.estimate()
         if clock is not None:
             _account(clock, estimate, problem.builders)
@@ -122,12 +122,12 @@ def solve_passes(
             return estimate, pass_state, count
         # Least squares bent by outliers is a poor start for a redescending loss: settled stretch by stretch it stays
         # near the truth, and a burst stands out against what is foretold. Where it loses its way, least squares it is.
-        if pass_state.phase == "robust" and not (estimate.converged or coarse_start or diverged):
-            pass_state = replace(pass_state, phase="plain", control=0.0, rejected={})
+        if pass_state.phase is Phase.ROBUST and not (estimate.converged or coarse_start or diverged):
+            pass_state = replace(pass_state, phase=Phase.PLAIN, robust_floor_m=0.0, rejected={})
             initial_values, diverged, most = first, True, most + 2
             continue
         initial_values = estimate.values
-        if pass_state.phase == "plain" and learnt.phase == "robust" and learnt.stage == 0 and not coarse_start:
+        if pass_state.phase is Phase.PLAIN and learnt.phase is Phase.ROBUST and learnt.stage == 0 and not coarse_start:
             initial_values, learnt = (
                 (initial_values if diverged else first),
                 widen_robust_scale(problem.builders, learnt, BENT_M if diverged else WIDE_M),
@@ -144,16 +144,16 @@ def _window_by_window(
     """Values to begin from, and what they teach, where inertial data alone stray too far: as a replay has it, the
     trajectory never leaves what standstills and images hold."""
     smoother, t0_ns = incremental(ReplayConfig(), problem.session.t0_ns), problem.session.t0_ns
-    first, previous = replace(pass_state, phase="causal", settled={}), None
+    first, previous = replace(pass_state, phase=Phase.CAUSAL, outlier_tests={}), None
     with _no_collection():
         for window in watched("window by window", windows, progress):
             smoother.update(build_update(window, previous, builders, first, t0_ns))
             previous = smoother.known()
-    judged = replace(pass_state, settled={})
+    judged = replace(pass_state, outlier_tests={})
     if pass_state.stage < LAST_STAGE:
         return smoother.values(), judged
     estimate = smoother.estimate()
-    return estimate.values, settled(builders, estimate, judged)
+    return estimate.values, check_pairs(builders, estimate, judged)
 
 
 def _forget(builders: Sequence[Builder]) -> None:

@@ -155,7 +155,7 @@ def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], di
     times = keyframe_times(span, epochs, context.gaps, spacing, standing)
     imu = bridged(session.require_imu(), context.gaps, context.bridges)
     windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
-    return delayed.arrange(windows, streams, merge) if causal else (windows, {})
+    return delayed.assign(windows, streams, merge) if causal else (windows, {})
 
 
 def make_builders(context: FactorContext) -> list[Builder]:
@@ -168,14 +168,14 @@ def recut(problem: Problem, available_ns: int | None = None) -> Problem:
     Only rows known by `available_ns` where that is given; the problem itself where there is no difference."""
     session, config, gaps = problem.session, problem.config, problem.gaps
     merge = round(config.keyframes.merge_s * NS)
-    if not gaps and not any(delayed.is_late(stream, merge).any() for stream in session.absolute().values()):
+    if not gaps and not any(delayed.is_delayed(stream, merge).any() for stream in session.absolute().values()):
         return problem
     context = FactorContext(
         session, problem.calibration, gaps, problem.vehicle, config, problem.rests, pairs=problem.pairs
     )
     windows, _ = cut(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
     if available_ns is not None:
-        windows = delayed.forget(windows, session.streams(), available_ns)
+        windows = delayed.drop_unknown(windows, session.streams(), available_ns)
     return replace(problem, windows=windows, builders=make_builders(context))
 
 

@@ -22,7 +22,7 @@ from smartnav_graph.estimate.result.diagnostics import UpdateLog
 from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.run import Run, _finish, initialise
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.update import build_update
 from smartnav_graph.session.session import Session
@@ -52,7 +52,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     smoother = incremental(options, problem.session.t0_ns)
     builders = [initial.prior.placed(), *problem.builders]
     wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.pass_state))
-    pass_state = replace(initial.pass_state, phase="causal", correlated=wandering, stage=LAST_STAGE)
+    pass_state = replace(initial.pass_state, phase=Phase.CAUSAL, correlated=wandering, stage=LAST_STAGE)
     log = UpdateLog()
     states: list[State] = []
     interrupted = False

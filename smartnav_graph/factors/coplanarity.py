@@ -133,14 +133,14 @@ class CoplanarityBuilder:
         """The pairs whose second image stands at the window's end."""
         if previous is None:
             self._begin()
-        elif pass_state.phase == "causal":
+        elif pass_state.causal:
             self._go_on(window, previous)
         image = self._image_at(window.t1_ns)
         if image is None:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
         ending = self._ending(image)
-        if pass_state.phase == "causal":
+        if pass_state.causal:
             self._look_now(image, update)
             self._judge_now(self._model(pass_state), ending)
         self._add_pairs(update, ending, pass_state)
@@ -151,7 +151,7 @@ class CoplanarityBuilder:
         if image is not None:
             update.blocks = [block for block in update.blocks if block.sensor != self.name]
             self._add_pairs(update, self._ending(image), pass_state)
-            update.hold(pass_state.held)
+            update.hold(pass_state.fixed_states)
 
     def _ending(self, image: int) -> NDArray[np.intp]:
         """Pairs whose second image this is, and whose first one has a keyframe."""
@@ -183,11 +183,11 @@ class CoplanarityBuilder:
 
     def replaced(self, pass_state: PassState) -> bool:
         """Whether tracks stand in for the pairs in a pass with this memory."""
-        return pass_state.settled.get(SMART, 0) > 0 and pass_state.phase != "causal"
+        return pass_state.tests(SMART) > 0 and not pass_state.causal
 
     def verdict_of(self, pass_state: PassState) -> NDArray[np.intp]:
         """What became of each pair (n,) in a pass with this memory."""
-        return self.verdict if pass_state.settled.get(self.name) else self.at_once
+        return self.verdict if pass_state.tests(self.name) else self.at_once
 
     def _begin(self) -> None:
         """Forget the pass before."""
@@ -208,7 +208,7 @@ class CoplanarityBuilder:
         """The row model of a pass: made anew where what was learnt changed."""
         learnt = (
             pass_state.rejected.get("matches"),
-            pass_state.settled.get(self.name, 0),
+            pass_state.tests(self.name),
             pass_state.scale(self.name),
             pass_state.phase,
         )
@@ -218,9 +218,9 @@ class CoplanarityBuilder:
 
     def _new_model(self, pass_state: PassState) -> RowModel:
         sigma = self.sigma * pass_state.scale(self.name)
-        if pass_state.phase == "causal":
+        if pass_state.causal:
             return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), self.config.reach)
-        use, settled = self._padded_use(pass_state), pass_state.settled.get(self.name, 0)
+        use, settled = self._padded_use(pass_state), pass_state.tests(self.name)
         if settled == COMPRESSED and self.frozen is not None and self.config.compress:
             return CompressedRows(self.pairs, self.rig, sigma, use, self.config.reach, self.frozen)
         return PairRows(self.pairs, self.rig, sigma, use, self.config.reach)

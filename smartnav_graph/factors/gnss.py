@@ -23,7 +23,7 @@ from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gauss_markov import add_wander, wander_sigma
 from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate, RowModel
@@ -187,8 +187,8 @@ class PositionBuilder:
         """Loss of one fix in the phase at hand; see `PassState`."""
         if not self.gated:
             return self.config.loss
-        if pass_state.phase != "causal" or update.variance is None:
-            return "cauchy" if pass_state.phase == "robust" else "none"
+        if not pass_state.causal or update.variance is None:
+            return "cauchy" if pass_state.phase is Phase.ROBUST else "none"
         foretold = update.predicted.position() + update.predicted.attitude().matrix() @ self.lever[row]
         wander = wander_sigma(self.noise) ** 2 if self.name in pass_state.correlated else 0.0
         square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + update.variance + wander)).sum())
@@ -227,10 +227,10 @@ class PositionBuilder:
         states = self._states(pass_state)
         for row in window.rows.get(self.name, ()):
             self._add_row(update, int(row), pass_state, states, self._at_keyframe(update, window, states))
-        for late in window.late.get(self.name, ()):
+        for delayed in window.delayed.get(self.name, ()):
             assert previous is not None
-            partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
-            self._add_row(update, late.row, pass_state, states, (late.window.index - 1, partial))
+            partial = preintegrated(delayed.window, delayed.t_ns, previous.bias, self.gravity)
+            self._add_row(update, delayed.row, pass_state, states, (delayed.window.index - 1, partial))
 
     def force(self, window: Window, nav_R_body: Floats, bias: Floats) -> Floats:
         """Accelerometer reading (3,) at the window's end; of a body not accelerated where the window has no samples."""
@@ -262,7 +262,7 @@ class PositionBuilder:
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         loss = self._loss_of(row, sigma, update, pass_state) if index == update.index else self._loss_late(pass_state)
         if pass_state.narrowing and loss == "cauchy":
-            sigma = np.maximum(sigma, pass_state.control)
+            sigma = np.maximum(sigma, pass_state.robust_floor_m)
         sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
         chain = self.name in pass_state.correlated
         if partial is None and not (states or chain):

@@ -149,7 +149,7 @@ class ImuBuilder:
         sigma^2 T = (density^2 T) + (share |turn|)^2, for a device of which no more than its class is known, in replay.
         """
         known = self.weight != CLASS_WEIGHT or self.config.scale_sigma > 0
-        if pass_state.phase != "causal" or known or window.kind == "gap" or not self.config.scale_error_share:
+        if not pass_state.causal or known or window.kind == "gap" or not self.config.scale_error_share:
             return pass_state
         turn = float(np.linalg.norm(window.dt @ (window.gyro - bias.gyroscope())))
         own = self.noise.gyro_noise_density * np.sqrt(window.length_s)

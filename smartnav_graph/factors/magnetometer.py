@@ -180,7 +180,7 @@ class MagnetometerBuilder:
 
     def _usable(self, pass_state: PassState) -> bool:
         """A hard iron that is held although nobody knows it would pass for north."""
-        return self.speaks(pass_state.phase == "causal", IRON in pass_state.held)
+        return self.speaks(pass_state.causal, IRON in pass_state.fixed_states)
 
     def speaks(self, causal: bool, held: bool = False) -> bool:
         """Whether rows are used in a replay (`causal`) or a batch run, the hard iron being held or not."""

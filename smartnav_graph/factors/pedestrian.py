@@ -153,7 +153,7 @@ class StepBuilder:
         fixes, spacing = self.fixes_ns, round(self.config.spacing_s * NS)
         after = int(np.searchsorted(fixes, window.t1_ns))
         before = int(np.searchsorted(fixes, window.t0_ns, side="right")) - 1
-        if pass_state.phase == "causal":
+        if pass_state.causal:
             since = window.t1_ns - int(fixes[before]) if before >= 0 else spacing
             last = int(fixes[before] - fixes[before - 1]) if before >= 1 else 0
             return max(since, last) >= spacing

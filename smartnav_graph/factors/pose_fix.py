@@ -26,7 +26,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
 from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import SessionState, State
 from smartnav_graph.graph.update import FactorBatch, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
@@ -154,11 +154,11 @@ class AttitudeBuilder:
             if self.known[row]:
                 partial = self._here(update, window) if "T" in states else None
                 self._add_row(update, int(row), pass_state, states, update.index, partial)
-        for late in window.late.get(NAME, ()):
-            if self.known[late.row]:
+        for delayed in window.delayed.get(NAME, ()):
+            if self.known[delayed.row]:
                 assert previous is not None
-                partial = preintegrated(late.window, late.t_ns, previous.bias, self.gravity)
-                self._add_row(update, late.row, pass_state, states, late.window.index - 1, partial)
+                partial = preintegrated(delayed.window, delayed.t_ns, previous.bias, self.gravity)
+                self._add_row(update, delayed.row, pass_state, states, delayed.window.index - 1, partial)
 
     def _here(self, update: GraphUpdate, window: Window) -> PartialPreintegration:
         """The instant of the keyframe itself; only its rate matters to an attitude."""
@@ -188,7 +188,7 @@ class AttitudeBuilder:
         """Loss in the phase at hand; see `PassState`."""
         if self.config.loss != "gate":
             return self.config.loss
-        return "huber" if pass_state.phase in ("robust", "causal") else "none"
+        return "huber" if pass_state.phase in (Phase.ROBUST, Phase.CAUSAL) else "none"
 
 
 def build(context: FactorContext) -> PoseFixBuilder | None:

@@ -106,6 +106,6 @@ class PriorBuilder:
         )
 
     def _sigma_rot(self, pass_state: PassState) -> Floats:
-        if self.magnetic_stage is None or pass_state.stage < self.magnetic_stage or IRON in pass_state.held:
+        if self.magnetic_stage is None or pass_state.stage < self.magnetic_stage or IRON in pass_state.fixed_states:
             return self.sigma_rot
         return np.array([*self.sigma_rot[:2], UNKNOWN_ANGLE])

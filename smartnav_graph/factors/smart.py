@@ -123,7 +123,7 @@ class SmartBuilder:
 
     def in_force(self, pass_state: PassState) -> bool:
         """Whether tracks stand in for image pairs in a pass with this memory."""
-        return pass_state.settled.get(self.name, 0) > 0 and pass_state.phase != "causal"
+        return pass_state.tests(self.name) > 0 and not pass_state.causal
 
     def _factor(self, row: int, pass_state: PassState) -> Any:
         noise = gtsam.noiseModel.Isotropic.Sigma(2, FOCAL * self.sigma * pass_state.scale(self.name))

@@ -17,7 +17,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 
 
-def first_control(square: Floats, limit: float) -> float:
+def first_mu(square: Floats, limit: float) -> float:
     """mu at which the surrogate is convex for squares (m,) and c^2 = `limit`; infinite where no row is near it."""
     largest = float(square.max(initial=0.0))
     return limit / (2.0 * largest - limit) if 2.0 * largest > limit else np.inf
@@ -31,7 +31,7 @@ def weights(square: Floats, limit: float, mu: float) -> Floats:
     return np.asarray(np.clip(middle, 0.0, 1.0))
 
 
-def settled(weight: Floats) -> bool:
+def converged(weight: Floats) -> bool:
     """Whether every weight is as good as 0 or 1."""
     return bool((np.minimum(weight, 1.0 - weight) < 0.01).all())
 

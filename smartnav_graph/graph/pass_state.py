@@ -4,59 +4,86 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask
+
+
+class Phase(Enum):
+    """How a pass treats outliers among the fixes.
+
+    PLAIN : least squares; ROBUST : a redescending loss finds outliers; GRADUATED : graduated non-convexity (GNC), where
+    configured; GATED : least squares without the outliers; CAUSAL : replay, least squares, with a redescending loss
+    where a fix is inconsistent with its prediction
+    """
+
+    PLAIN = "plain"
+    ROBUST = "robust"
+    GRADUATED = "graduated"
+    GATED = "gated"
+    CAUSAL = "causal"
+
+
+# Stage 0 has what finds the trajectory (fixes, standstills), stage 1 also what needs it found first (vehicle
+# constraints, time offsets, magnetometer, steps).
+LAST_STAGE = 1
 
 
 @dataclass(frozen=True)
 class PassState:
-    """What one pass teaches the next.
+    """What one pass leaves to the next.
 
-    noise_scales : factor on the class-default sigma by group name
+    noise_scales : factor on the default sigma by group name
     rejected : rows not used, by sensor
-    correlated : sensors whose errors are known to wander, and get a Gauss-Markov state
-    held : session states that stay at a value (d,), by name
-    stage : 0 has what finds the trajectory (fixes, standstills), 1 also what needs it found first (vehicle
-    constraints, time offsets, magnetometer, steps)
-    settled : passes that a builder has spent on judging what it is made of
-    weights : of rows between 0 and 1 while the loss is graduated, by sensor; control : how far from convex it is, or in
-    the robust phase the least sigma (m) that a fix has under the loss
-    phase : ``plain`` (least squares), ``robust`` (a redescending loss finds outliers), ``graduated`` (truncated least
-    squares by and by, where asked for), ``gated`` (least squares without outliers), ``causal`` (replay: least squares,
-    a redescending loss where a fix contradicts the prediction)
+    correlated : sensors with a Gauss-Markov state for their correlated errors
+    fixed_states : session states fixed at a value (d,), by name
+    stage : a builder takes part from its own `stage` on
+    phase : treatment of outliers
+    outlier_tests : how often image pairs and tracks were tested against a solution, by builder
+    weights, gnc_mu : weights of rows between 0 and 1 by sensor, and the control parameter mu of GNC
+    robust_floor_m : least sigma (m) of a fix under the redescending loss
     """
 
     noise_scales: Mapping[str, float] = field(default_factory=dict)
     rejected: Mapping[str, frozenset[int]] = field(default_factory=dict)
     correlated: frozenset[str] = frozenset()
-    held: Mapping[str, Floats] = field(default_factory=dict)
+    fixed_states: Mapping[str, Floats] = field(default_factory=dict)
     stage: int = 0
-    phase: str = "plain"
-    settled: Mapping[str, int] = field(default_factory=dict)
+    phase: Phase = Phase.PLAIN
+    outlier_tests: Mapping[str, int] = field(default_factory=dict)
     weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
-    control: float = 0.0
+    gnc_mu: float = 0.0
+    robust_floor_m: float = 0.0
 
     def weight(self, sensor: str, row: int) -> float:
-        """Weight of a row while the loss is graduated, 1 otherwise."""
+        """Weight of a row under GNC, 1 otherwise."""
         return self.weights.get(sensor, {}).get(row, 1.0)
 
     @property
     def narrowing(self) -> bool:
-        """Whether a loss is still wider than the noise."""
-        return self.phase == "robust" and self.control > 0.0
+        """Whether the redescending loss is still wider than the noise."""
+        return self.phase is Phase.ROBUST and self.robust_floor_m > 0.0
+
+    @property
+    def causal(self) -> bool:
+        """Whether this is a replay."""
+        return self.phase is Phase.CAUSAL
 
     def scale(self, group: str) -> float:
+        """Factor on the default sigma of a group."""
         return self.noise_scales.get(group, 1.0)
 
-    def used(self, sensor: str, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def tests(self, builder: str) -> int:
+        """How often the image pairs or tracks of a builder were tested against a solution."""
+        return self.outlier_tests.get(builder, 0)
+
+    def used(self, sensor: str, rows: NDArray[np.intp]) -> Mask:
         """Mask of the rows (m,) of a sensor that are not rejected."""
         return ~np.isin(rows, list(self.rejected.get(sensor, frozenset())))
 
     def is_rejected(self, sensor: str, row: int) -> bool:
+        """Whether a row of a sensor is rejected."""
         return row in self.rejected.get(sensor, frozenset())
-
-
-LAST_STAGE = 1

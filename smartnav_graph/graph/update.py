@@ -185,5 +185,5 @@ def build_update(
     for builder in builders:
         if builder.stage <= pass_state.stage:
             builder.add(update, window, previous, pass_state)
-    update.hold(pass_state.held)
+    update.hold(pass_state.fixed_states)
     return update

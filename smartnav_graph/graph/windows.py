@@ -19,7 +19,7 @@ class Window:
     dt (m,) s, accel (m, 3) m/s^2, gyro (m, 3) rad/s : inertial intervals, means over each interval, borders
     interpolated; the force is given in body axes at the interval's start
     rows : row indices of each aiding stream at t1
-    late : rows that speak of an earlier time and became known in this window
+    delayed : rows of an earlier time that became known in this window
     """
 
     index: int
@@ -30,7 +30,7 @@ class Window:
     accel: Floats
     gyro: Floats
     rows: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
-    late: Mapping[str, Sequence[DelayedRow]] = field(default_factory=dict)
+    delayed: Mapping[str, Sequence[DelayedRow]] = field(default_factory=dict)
 
     @property
     def length_s(self) -> float:
@@ -39,7 +39,7 @@ class Window:
 
 @dataclass(frozen=True)
 class DelayedRow:
-    """A row of a stream that arrived after the window it speaks of: `t_ns` lies in `window`."""
+    """A row that arrived after the window of its measurement time `t_ns`, which is `window`."""
 
     row: int
     t_ns: int

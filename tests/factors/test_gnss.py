@@ -14,7 +14,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, fix_sigmas, noise_model
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
@@ -115,7 +115,12 @@ def test_a_loss_acts_on_the_whole_fix(loss, weighted):
 
 @pytest.mark.parametrize(
     ("loss", "phase", "robust"),
-    [("gate", "plain", False), ("gate", "robust", True), ("gate", "gated", False), ("huber", "plain", True)],
+    [
+        ("gate", Phase.PLAIN, False),
+        ("gate", Phase.ROBUST, True),
+        ("gate", Phase.GATED, False),
+        ("huber", Phase.PLAIN, True),
+    ],
 )
 def test_the_loss_follows_the_phase(loss, phase, robust):
     ((_, factor),) = added(builder(loss=loss), PassState(phase=phase)).factors
@@ -130,12 +135,12 @@ def test_the_loss_follows_the_phase(loss, phase, robust):
 def test_replay_doubts_a_fix_that_contradicts_the_prediction(off_m, robust):
     update = GraphUpdate(7, NS, 1.0, predicted=gtsam.NavState(), variance=np.full(3, 3.0))
     fixes = builder(position=[[off_m, 0.0, 0.0]], sigma=[[1.0, 1.0, 1.0]])
-    ((_, factor),) = added(fixes, PassState(phase="causal"), update).factors
+    ((_, factor),) = added(fixes, PassState(phase=Phase.CAUSAL), update).factors
     assert isinstance(factor.noiseModel(), gtsam.noiseModel.Robust) == robust
 
 
 def test_replay_takes_a_fix_at_its_word_where_nothing_is_foretold():
-    ((_, factor),) = added(builder(position=[[1e6, 0, 0]]), PassState(phase="causal")).factors
+    ((_, factor),) = added(builder(position=[[1e6, 0, 0]]), PassState(phase=Phase.CAUSAL)).factors
     assert not isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 
@@ -143,7 +148,7 @@ def test_the_lever_arm_is_part_of_what_is_foretold():
     rotate = gtsam.NavState(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3), np.zeros(3))
     fixes = builder(position=[[0.0, 40.0, 0.0]], sigma=[[1.0, 1.0, 1.0]], lever=(40.0, 0.0, 0.0))
     update = GraphUpdate(7, NS, 1.0, predicted=rotate, variance=np.full(3, 3.0))
-    ((_, factor),) = added(fixes, PassState(phase="causal"), update).factors
+    ((_, factor),) = added(fixes, PassState(phase=Phase.CAUSAL), update).factors
     assert not isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 

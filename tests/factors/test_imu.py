@@ -16,7 +16,7 @@ from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
 from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.factors.imu import ImuBuilder, ImuConfig
 from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
@@ -239,7 +239,7 @@ def test_a_turn_raises_the_noise_of_an_uncalibrated_gyro_in_replay():
     window = Window(1, 0, NS // 2, "normal", dt, np.zeros((50, 3)), gyro)
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.2]))
     builder = ImuBuilder(DEVICE_CLASSES["mems"], 9.81)
-    causal = PassState(phase="causal")
+    causal = PassState(phase=Phase.CAUSAL)
     found = builder.turning(window, bias, causal).scale("gyro") * DEVICE_CLASSES["mems"].gyro_noise_density
     own = DEVICE_CLASSES["mems"].gyro_noise_density
     assert found**2 * 0.5 == pytest.approx(own**2 * 0.5 + (0.005 * 0.3) ** 2)

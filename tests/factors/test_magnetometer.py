@@ -23,7 +23,7 @@ from smartnav_graph.factors.magnetometer import (
     turned_mean,
     unearthly,
 )
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
@@ -191,14 +191,14 @@ def test_intensity_and_dip_tell_a_disturbance(field_ut, used):
 @pytest.mark.parametrize(("sigma", "used"), [(1.0, True), (15.0, False)])
 def test_a_held_hard_iron_is_used_only_where_it_was_calibrated(sigma, used):
     made = builder(iron_sigma=sigma)
-    pass_state = PassState(stage=1, held={"magnetometer_hard_iron_ut": np.zeros(3)})
+    pass_state = PassState(stage=1, fixed_states={"magnetometer_hard_iron_ut": np.zeros(3)})
     (block,) = step_of(made, turning((0.0, 0.0, 0.0)), pass_state).blocks
     assert block.used == (used,)
 
 
 def test_first_seconds_make_a_held_hard_iron_usable_and_leave_its_prior_as_wide_as_it_was():
     made = builder(iron_sigma=240.0, held_in_replay=True, reading=np.tile(NAV_FIELD + IRON, (100, 1)))
-    causal = PassState(stage=1, phase="causal")
+    causal = PassState(stage=1, phase=Phase.CAUSAL)
     assert step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks[0].used == (False,)
     made.begin(IRON, 2.0)
     (block,) = step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks

@@ -17,7 +17,7 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import pedestrian as step_factor
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.pedestrian import StepBuilder, StepConfig, Stride, level_yaw, model_of
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
@@ -155,7 +155,7 @@ def test_a_stand_is_a_row_of_no_length_and_no_row_stands_in_a_gap_or_upside_down
 def test_good_fixes_close_together_need_no_steps(fixes_s, batch, causal):
     made = builder(fixes_ns=(np.array(fixes_s) * NS).astype(np.int64))
     assert bool(add(made, turning(0.0)).blocks) == batch
-    assert bool(add(made, turning(0.0), pass_state=PassState(phase="causal")).blocks) == causal
+    assert bool(add(made, turning(0.0), pass_state=PassState(phase=Phase.CAUSAL)).blocks) == causal
 
 
 # --- who walks --------------------------------------------------------------------------------------------------------

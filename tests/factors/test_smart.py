@@ -12,7 +12,7 @@ from smartnav_graph.estimate import config
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.factors.coplanar_rows import Rig
 from smartnav_graph.factors.smart import FOCAL, IN_USE, SmartConfig
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.session.streams import Tracks
@@ -20,7 +20,7 @@ from smartnav_graph.simulation.scenarios import SCENARIOS
 
 ROOM = SCENARIOS["room-30s"]
 EXACT = replace(ROOM, camera=replace(ROOM.camera, camera=replace(ROOM.camera.camera, noise_px=1e-9)))
-IN_FORCE = PassState(stage=1, phase="gated", settled={"smart": 1})
+IN_FORCE = PassState(stage=1, phase=Phase.GATED, outlier_tests={"smart": 1})
 SIGMA = 1e-3
 
 
@@ -135,7 +135,7 @@ def test_a_point_is_searched_to_the_end(problem):
 
 def test_tracks_join_once_they_are_judged(problem):
     builder = smart(problem)
-    for pass_state in (PassState(stage=1), replace(IN_FORCE, phase="causal")):
+    for pass_state in (PassState(stage=1), replace(IN_FORCE, phase=Phase.CAUSAL)):
         assert not any(step.factors for step in steps(problem, builder, pass_state))
     builder.verdict[::2] = 0 * builder.verdict[::2] + 1
     some = steps(problem, builder)

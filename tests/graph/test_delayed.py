@@ -47,9 +47,9 @@ def fixes(t_s: list[float], arrival_s: list[float]) -> GnssFix:
     ],
 )
 def test_a_row_reaches_the_window_in_which_it_arrives(t_s, arrival_s, arrives, speaks):
-    found, lost = delayed.arrange(windows(0, 1, 2, 3, 4), {"gnss": fixes([t_s], [arrival_s])}, 1000)
-    assert [w.index for w in found if w.late] == [arrives] and not lost
-    (row,) = found[arrives].late["gnss"]
+    found, lost = delayed.assign(windows(0, 1, 2, 3, 4), {"gnss": fixes([t_s], [arrival_s])}, 1000)
+    assert [w.index for w in found if w.delayed] == [arrives] and not lost
+    (row,) = found[arrives].delayed["gnss"]
     assert (row.row, row.t_ns, row.window.index) == (0, round(t_s * NS), speaks)
     assert row.window.t0_ns <= row.t_ns < row.window.t1_ns <= found[arrives].t1_ns
 
@@ -58,27 +58,27 @@ def test_late_rows_leave_the_keyframe_they_share_an_epoch_with():
     stream = fixes([1.0, 2.0], [1.0, 2.5])
     made = windows(0, 1, 2, 3)
     made = [replace(w, rows={"gnss": np.array([w.index - 1])} if w.index in (1, 2) else {}) for w in made]
-    found, _ = delayed.arrange(made, {"gnss": stream}, 1000)
+    found, _ = delayed.assign(made, {"gnss": stream}, 1000)
     assert found[1].rows["gnss"].tolist() == [0] and not found[2].rows
-    assert [row.row for row in found[3].late["gnss"]] == [1]
+    assert [row.row for row in found[3].delayed["gnss"]] == [1]
 
 
 def test_rows_are_handed_over_as_they_arrive_and_lost_ones_counted():
     stream = fixes([0.1, 0.2, 0.3, 0.4], [1.9, 1.5, 9.0, 0.4])
-    found, lost = delayed.arrange(windows(0, 1, 2), {"gnss": stream}, 1000)
-    assert [row.row for row in found[2].late["gnss"]] == [1, 0] and lost == {"gnss": 1}
-    assert delayed.is_late(stream, 1000).tolist() == [True, True, True, False]
+    found, lost = delayed.assign(windows(0, 1, 2), {"gnss": stream}, 1000)
+    assert [row.row for row in found[2].delayed["gnss"]] == [1, 0] and lost == {"gnss": 1}
+    assert delayed.is_delayed(stream, 1000).tolist() == [True, True, True, False]
 
 
 def test_nothing_late_changes_nothing():
     made = windows(0, 1, 2)
-    found, lost = delayed.arrange(made, {"gnss": replace(fixes([1.0], [1.0]), arrival_ns=None)}, 1000)
+    found, lost = delayed.assign(made, {"gnss": replace(fixes([1.0], [1.0]), arrival_ns=None)}, 1000)
     assert all(one is other for one, other in zip(found, made, strict=True)) and lost == {}
 
 
 def test_what_was_not_known_is_forgotten():
     made = [replace(w, rows={"gnss": np.array([w.index])}) for w in windows(0, 1, 2)]
-    found = delayed.forget(made, {"gnss": fixes([0.0, 1.0, 2.0], [0.0, 2.5, 2.0])}, 2 * NS)
+    found = delayed.drop_unknown(made, {"gnss": fixes([0.0, 1.0, 2.0], [0.0, 2.5, 2.0])}, 2 * NS)
     assert [w.rows for w in found] == [{"gnss": [0]}, {}, {"gnss": [2]}]
 
 
@@ -111,7 +111,7 @@ def test_no_keyframe_stands_where_nobody_knew_of_a_row():
     known = session.gnss.arrival_ns[:-1]
     assert np.isin(session.gnss.t_ns, batch_ns).all() and np.isin(known, causal_ns).all()
     assert np.isin(session.gnss.t_ns, causal_ns).sum() <= 2  # the start, and a border of the rest
-    assert sum(len(w.late.get("gnss", ())) for w in causal.windows) == len(known)
+    assert sum(len(w.delayed.get("gnss", ())) for w in causal.windows) == len(known)
     assert causal.dropped == {"gnss": {"arrived after the end": 1}} and batch.dropped == {}
     again = recut(causal)
     assert [(w.t1_ns, dict(w.rows)) for w in again.windows] == [(w.t1_ns, dict(w.rows)) for w in batch.windows]

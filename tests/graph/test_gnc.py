@@ -26,16 +26,16 @@ def test_weights_are_the_derivative_of_the_surrogate():
 
 
 def test_it_begins_with_hardly_any_difference_and_ends_truncated():
-    begin = gnc.weights(SQUARES, LIMIT, gnc.first_control(SQUARES, LIMIT))
+    begin = gnc.weights(SQUARES, LIMIT, gnc.first_mu(SQUARES, LIMIT))
     assert (np.diff(begin) <= 0).all() and begin[-1] > 0  # every row still pulls
     end = gnc.weights(SQUARES, LIMIT, 1e6)
-    assert gnc.settled(end) and end.round().tolist() == [1, 1, 1, 1, 0, 0, 0]
+    assert gnc.converged(end) and end.round().tolist() == [1, 1, 1, 1, 0, 0, 0]
     assert gnc.weights(SQUARES, LIMIT, np.inf).tolist() == [1, 1, 1, 1, 0, 0, 0]
 
 
 def test_where_no_row_is_near_the_limit_it_is_least_squares_at_once():
     small = np.array([0.1, 4.0])
-    assert gnc.first_control(small, LIMIT) == np.inf and gnc.first_control(np.zeros(0), LIMIT) == np.inf
+    assert gnc.first_mu(small, LIMIT) == np.inf and gnc.first_mu(np.zeros(0), LIMIT) == np.inf
     assert gnc.weights(small, LIMIT, np.inf).tolist() == [1.0, 1.0]
 
 
@@ -55,7 +55,7 @@ def test_a_line_through_half_outliers_is_found(seed):
         root = np.sqrt(weight)
         fit = np.linalg.lstsq(A * root[:, None], y * root, rcond=None)[0]
         square = ((y - A @ fit) / 0.1) ** 2
-        mu = gnc.first_control(square, limit) if mu is None else 1.4 * mu
+        mu = gnc.first_mu(square, limit) if mu is None else 1.4 * mu
         weight = gnc.weights(square, limit, mu)
     np.testing.assert_allclose(fit, [3.0, 1.0], atol=0.15)
     assert set(np.flatnonzero(weight < 0.5)) >= set(bad)

@@ -99,4 +99,4 @@ def test_memory_knows_nothing_at_first_and_cannot_be_written():
         and not pass_state.is_rejected("control", 3)
     )
     with pytest.raises(dataclasses.FrozenInstanceError):
-        pass_state.phase = "robust"
+        pass_state.stage = 1

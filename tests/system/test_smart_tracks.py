@@ -137,7 +137,7 @@ def solved(room):
     estimate, pass_state, _ = solve_passes(
         problem, problem.windows, initial.prior, initial.pass_state, initial_values=initial.initial_values
     )
-    assert pass_state.settled["smart"] == 2
+    assert pass_state.outlier_tests["smart"] == 2
     return problem, estimate, pass_state
 
 
@@ -145,10 +145,10 @@ def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
     problem, estimate, pass_state = solved
     builder = replace(next(b for b in problem.builders if b.name == "smart"))
     pairs = next(b for b in problem.builders if b.name == "coplanarity")
-    assert pairs.replaced(pass_state) and "images_time_offset_s" in pass_state.held
+    assert pairs.replaced(pass_state) and "images_time_offset_s" in pass_state.fixed_states
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, builder.sightings.xy.shape)
     builder.sightings = replace(builder.sightings, xy=xy)
-    first = replace(pass_state, settled={**pass_state.settled, "smart": 1})
+    first = replace(pass_state, outlier_tests={**pass_state.outlier_tests, "smart": 1})
     again = chosen([builder, pairs], estimate, first)
     assert not pairs.replaced(again) and not builder.in_force(again)
     assert "images_time_offset_s" not in again.held and "camera_boresight_rad" not in again.held

@@ -189,12 +189,12 @@ def _agree(problem: AlignmentProblem, R: Floats, p: Floats, v: Floats) -> Alignm
     state, weight = problem.start(R, p, v), np.ones(len(problem.t))
     for _ in range(FIRST_STEPS):
         state = problem.better(state, weight)
-    mu = gnc.first_control(state.square, LIMIT)
+    mu = gnc.first_mu(state.square, LIMIT)
     for _ in range(STEPS):
         weight = gnc.weights(state.square, LIMIT, mu)
         for _ in range(2):
             state = problem.better(state, weight)
-        if np.isinf(mu) or (mu > 1.0 and gnc.settled(weight)):
+        if np.isinf(mu) or (mu > 1.0 and gnc.converged(weight)):
             break
         mu *= GROWTH
     return state

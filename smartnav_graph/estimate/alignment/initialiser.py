@@ -35,7 +35,7 @@ from smartnav_graph.estimate.alignment.static import (
     rest_over,
 )
 from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import ImuNoise
@@ -343,7 +343,7 @@ class Initialiser:
         rejected: dict[str, set[int]] = {}
         for name, row in (self.sources[i] for i in outside):
             rejected.setdefault(name, set()).add(row)
-        return PassState(phase="gated", rejected={name: frozenset(rows) for name, rows in rejected.items()})
+        return PassState(phase=Phase.GATED, rejected={name: frozenset(rows) for name, rows in rejected.items()})
 
     def _starts(self, count: int, rest: Rest | None) -> list[State]:
         """First states to try: the inertial curve laid on the fixes, then headings all round."""
@@ -401,7 +401,7 @@ class Initialiser:
             f"{stretch:.0f} s; {vertical}."
         )
         if _rejections(pass_state):
-            pass_state = replace(pass_state, phase="robust")  # there will be more of them
+            pass_state = replace(pass_state, phase=Phase.ROBUST)  # there will be more of them
         return InitialState(
             self._prior(state, rest), method, sentence, heading, min(sigma, 180.0), stretch, 1, pass_state
         )

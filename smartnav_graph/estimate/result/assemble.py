@@ -138,7 +138,7 @@ def _of_stack(stack: StackedFactors, estimate: Estimate) -> Part:
 
 def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:
     """Rows of a replay that have no keyframe of their own, at the time they speak of."""
-    stamps = {row.row: row.t_ns for window in problem.windows for row in window.late.get(sensor, ())}
+    stamps = {row.row: row.t_ns for window in problem.windows for row in window.delayed.get(sensor, ())}
     parts: list[Part] = []
     for stack in estimate.stacks(sensor) if stamps else ():
         late = np.isin(stack.rows, list(stamps))
@@ -247,7 +247,7 @@ def used_counts(problem: Problem, pass_state: PassState) -> Mapping[str, int]:
     """Rows of every absolute sensor that the solution rests on."""
     counts = {}
     for name in (builder.name for builder in position_builders(problem.builders)):
-        there = sum(len(w.rows.get(name, ())) + len(w.late.get(name, ())) for w in problem.windows)
+        there = sum(len(w.rows.get(name, ())) + len(w.delayed.get(name, ())) for w in problem.windows)
         unused = len(pass_state.rejected.get(name, ())) + problem.dropped.get(name, {}).get(TOO_LATE, 0)
         counts[name] = there - unused
     return counts

@@ -41,16 +41,16 @@ LARGEST_STRAY, FEW_ASTRAY = 0.3, 0.1
 SCALES = (0.3, 3.0)
 
 
-def settled(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The memory with the matches that agree with an estimate; unchanged once they are settled."""
     builder = one_of(builders, CoplanarityBuilder)
-    if builder is None or pass_state.settled.get(builder.name, 0) >= COMPRESSED:
+    if builder is None or pass_state.tests(builder.name) >= COMPRESSED:
         return pass_state
     return _judged(builder, estimate, pass_state)
 
 
 def _judged(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
-    passed, scale = pass_state.settled.get(builder.name, 0), pass_state.scale(builder.name)
+    passed, scale = pass_state.tests(builder.name), pass_state.scale(builder.name)
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, _, v, bias = (x[place] for x in estimate.states())
     builder.look(estimate.offset_s(STREAM), Motion(R, v, bias[:, 3:]))
@@ -72,7 +72,7 @@ def _judged(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassSta
         pass_state,
         rejected={**pass_state.rejected, **rejected},
         noise_scales={**pass_state.noise_scales, builder.name: scale},
-        settled={**pass_state.settled, builder.name: COMPRESSED if builder.refused else passed + 1},
+        outlier_tests={**pass_state.outlier_tests, builder.name: COMPRESSED if builder.refused else passed + 1},
     )
 
 
@@ -133,7 +133,7 @@ def account(builders: Iterable[Builder], pass_state: PassState) -> Account | Non
     count = np.bincount(verdict, minlength=len(REASONS))
     inside = verdict[builder.pairs.pair] == IN_USE
     use = builder.used_matches(pass_state)
-    refused = builder.refused if pass_state.settled else ""
+    refused = builder.refused if pass_state.outlier_tests else ""
     told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
     return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
 

@@ -34,14 +34,14 @@ POINT_DOF = 3
 SCALES = (0.3, 3.0)
 
 
-def chosen(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+def check_tracks(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The memory with the tracks that agree with an estimate; unchanged while pairs are not settled, and once tracks
     are."""
     found = one_of(builders, SmartBuilder)
-    if found is None or found.refused or pass_state.settled.get(found.name, 0) >= ROUNDS:
+    if found is None or found.refused or pass_state.tests(found.name) >= ROUNDS:
         return pass_state
     pairs = one_of(builders, CoplanarityBuilder)
-    if pairs is not None and pass_state.settled.get(pairs.name, 0) < COMPRESSED:
+    if pairs is not None and pass_state.tests(pairs.name) < COMPRESSED:
         return pass_state
     if pairs is not None and pairs.refused:
         found.refused = "smart: tracks are refused as the image pairs are"
@@ -50,7 +50,7 @@ def chosen(builders: Iterable[Builder], estimate: Estimate, pass_state: PassStat
 
 
 def _judged(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
-    passed, seen = pass_state.settled.get(builder.name, 0), builder.sightings
+    passed, seen = pass_state.tests(builder.name), builder.sightings
     if not passed:
         builder.boresight = estimate.session_value(BORESIGHT, 3)
     views = _views(builder, estimate)
@@ -64,9 +64,9 @@ def _judged(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) ->
     states = [estimate.session[s.name] for s in builder.camera_model.states().values() if s.name in estimate.session]
     return replace(
         pass_state,
-        held={**pass_state.held, **{state.name: state.value for state in states}},
+        fixed_states={**pass_state.fixed_states, **{state.name: state.value for state in states}},
         noise_scales={**pass_state.noise_scales, builder.name: _scale(builder, points)},
-        settled={**pass_state.settled, builder.name: passed + 1},
+        outlier_tests={**pass_state.outlier_tests, builder.name: passed + 1},
     )
 
 
@@ -75,8 +75,8 @@ def _without(builder: SmartBuilder, pass_state: PassState) -> PassState:
     names = {state.name for state in builder.camera_model.states().values()}
     return replace(
         pass_state,
-        held={name: value for name, value in pass_state.held.items() if name not in names},
-        settled={name: count for name, count in pass_state.settled.items() if name != builder.name},
+        fixed_states={name: value for name, value in pass_state.fixed_states.items() if name not in names},
+        outlier_tests={name: count for name, count in pass_state.outlier_tests.items() if name != builder.name},
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
-from smartnav_graph.estimate.reweight.image_pair_outliers import settled
+from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
 from smartnav_graph.estimate.reweight.imu_noise import noise_scales
 from smartnav_graph.estimate.reweight.outliers import (
     FixResiduals,
@@ -29,12 +29,12 @@ from smartnav_graph.estimate.reweight.outliers import (
     position_builders,
     verdicts,
 )
-from smartnav_graph.estimate.reweight.track_outliers import ROUNDS, chosen
+from smartnav_graph.estimate.reweight.track_outliers import ROUNDS, check_tracks
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.smart import SmartBuilder
 from smartnav_graph.factors.vehicle import VehicleBuilder
 from smartnav_graph.graph import gnc
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers.estimate import Estimate
@@ -70,8 +70,8 @@ def update_pass_state(
     new, done = _revised(builders, windows, estimate, pass_state)
     if new.stage < LAST_STAGE:
         return new, done
-    judged = settled(builders, estimate, new)
-    judged = chosen(builders, estimate, judged) if judged is new else judged
+    judged = check_pairs(builders, estimate, new)
+    judged = check_tracks(builders, estimate, judged) if judged is new else judged
     return judged, done and judged is new
 
 
@@ -85,17 +85,17 @@ def _revised(
     for builder, residuals in found.values():
         new = _rescaled(builder, residuals, new)
     judged = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
-    if pass_state.phase == "plain" and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
-        return replace(new, phase="robust"), False
+    if pass_state.phase is Phase.PLAIN and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
+        return replace(new, phase=Phase.ROBUST), False
     if pass_state.narrowing:
-        return replace(new, control=_shrink_robust_scale(found, pass_state.control)), False
+        return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
     outliers = {v.name: v.outside() for v in judged}
-    if pass_state.phase in ("robust", "graduated"):
+    if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
         weighed = _graduated(judged, pass_state)
         if weighed is not None:
             return replace(weighed, noise_scales=new.noise_scales), False
-        return replace(new, phase="gated", rejected=outliers, weights={}), False
-    if pass_state.phase == "gated":
+        return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
+    if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in found)
     tuned, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
@@ -110,7 +110,7 @@ def _revised(
 def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float = WIDE_M) -> PassState:
     """The memory of a robust pass from a start that is off by so many metres."""
     sigmas = [float(np.median(b.scaled_sigma(pass_state)[:, :2])) for b in position_builders(builders) if b.gated]
-    return replace(pass_state, control=metres if min(sigmas, default=metres) < metres / 3 else 0.0)
+    return replace(pass_state, robust_floor_m=metres if min(sigmas, default=metres) < metres / 3 else 0.0)
 
 
 def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], control: float) -> float:
@@ -128,16 +128,16 @@ def _graduated(judged: Sequence[Verdict], pass_state: PassState) -> PassState | 
     if not asked:
         return None
     squares = {v.name: v.relative() for v in asked}
-    if pass_state.phase == "robust":
-        control = min(gnc.first_control(square, 1.0) for square in squares.values())
+    if pass_state.phase is Phase.ROBUST:
+        mu = min(gnc.first_mu(square, 1.0) for square in squares.values())
     else:
-        control = GROWTH * pass_state.control
-    found = {name: gnc.weights(square, 1.0, control) for name, square in squares.items()}
-    if all(gnc.settled(weight) for weight in found.values()):
+        mu = GROWTH * pass_state.gnc_mu
+    found = {name: gnc.weights(square, 1.0, mu) for name, square in squares.items()}
+    if all(gnc.converged(weight) for weight in found.values()):
         return None
     weights = {v.name: dict(zip(v.rows.tolist(), found[v.name].tolist(), strict=True)) for v in asked}
     rejected = {v.name: v.outside() for v in judged if not v.graduated}
-    return replace(pass_state, phase="graduated", rejected=rejected, weights=weights, control=control)
+    return replace(pass_state, phase=Phase.GRADUATED, rejected=rejected, weights=weights, gnc_mu=mu)
 
 
 def extra_passes(builders: Iterable[Builder]) -> int:
@@ -159,7 +159,7 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
         for state in estimate.session.values()
         if not state.held and (state.sigma > OBSERVED * state.prior_sigma).all()
     }
-    return replace(pass_state, held={**pass_state.held, **blind}, correlated=wandering)
+    return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=wandering)
 
 
 def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
@@ -187,7 +187,7 @@ def _inertial(
     scales = noise_scales(builders, windows, estimate, pass_state, level)
     if any(builder.wanders(pass_state) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
-    if pass_state.settled or one_of(builders, VehicleBuilder) is not None:
+    if pass_state.outlier_tests or one_of(builders, VehicleBuilder) is not None:
         scales = {name: max(scale, pass_state.scale(name)) for name, scale in scales.items()}
     if pass_state.stage < LAST_STAGE:
         scales = {name: min(scale, pass_state.scale(name)) for name, scale in scales.items()}

@@ -17,7 +17,7 @@ from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.imu import ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, GnssNoise
 from smartnav_graph.session.streams import GnssFix
 from smartnav_graph.simulation import motions
@@ -107,7 +107,7 @@ def test_outliers_do_not_swell_the_sigma(drive):
 def test_planted_outliers_are_found_exactly(drive, off):
     pass_state, _ = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED))
     assert pass_state.rejected["gnss"] == frozenset(off)
-    assert pass_state.phase == "gated"
+    assert pass_state.phase is Phase.GATED
 
 
 def test_graduated_non_convexity_finds_them_too(drive):
@@ -115,7 +115,7 @@ def test_graduated_non_convexity_finds_them_too(drive):
     problem = prepare(with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off=off, seed=GOOD_SEED), gnc())
     initial = initialise(problem)
     _, pass_state, passes = solve_passes(problem, problem.windows, initial.prior, PassState())
-    assert pass_state.rejected["gnss"] == off and pass_state.phase == "gated" and not pass_state.weights
+    assert pass_state.rejected["gnss"] == off and pass_state.phase is Phase.GATED and not pass_state.weights
     assert 6 <= passes <= 20  # the control grows fourfold a pass
 
 
@@ -126,12 +126,12 @@ def gnc() -> Config:
 def test_the_control_grows_until_every_weight_is_settled(drive):
     session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
     builders, windows, estimate = at_truth(drive, session, loss="gnc")
-    pass_state, controls = PassState(phase="robust"), []
-    while pass_state.phase != "gated":
+    pass_state, controls = PassState(phase=Phase.ROBUST), []
+    while pass_state.phase is not Phase.GATED:
         pass_state, done = update_pass_state(builders, windows, estimate, pass_state)
         assert not done
-        controls.append(pass_state.control)
-        if pass_state.phase == "graduated":
+        controls.append(pass_state.gnc_mu)
+        if pass_state.phase is Phase.GRADUATED:
             assert pass_state.weight("gnss", 40) < 0.5 * pass_state.weight("gnss", 41)
     assert pass_state.rejected == {"gnss": frozenset({40})} and not pass_state.weights
     assert np.allclose(np.diff(np.log(controls[:-1])), np.log(4.0))
@@ -148,7 +148,7 @@ def test_outliers_among_the_first_fixes_do_not_mislead_the_start(drive, off):
 @pytest.mark.parametrize("seed", range(3))
 def test_good_fixes_are_all_kept_without_a_robust_pass(drive, seed):
     pass_state, passes = learn(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3, seed=seed))
-    assert not pass_state.rejected.get("gnss") and pass_state.phase == "plain" and passes <= 5  # the noise is found
+    assert not pass_state.rejected.get("gnss") and pass_state.phase is Phase.PLAIN and passes <= 5  # the noise is found
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -163,7 +163,7 @@ def test_a_loss_that_is_no_gate_rejects_nothing(drive):
         problem = prepare(session, Config(gnss=GnssConfig(loss=loss), imu=ImuConfig(estimate_noise=False)))
         graph = assemble(session, drive.truth)
         learnt, done = update_pass_state(problem.builders, graph.windows, estimate_of(graph), PassState())
-        assert learnt.phase == "plain" and not learnt.rejected
+        assert learnt.phase is Phase.PLAIN and not learnt.rejected
         assert not done and learnt.stage == 1  # the clock joins
         assert update_pass_state(problem.builders, graph.windows, estimate_of(graph), learnt) == (learnt, True)
 
@@ -221,9 +221,9 @@ def test_phases_follow_each_other(drive):
     session = with_fixes(drive, [1.0] * 3, told=[1.0] * 3, off={40})
     builders, windows, estimate = at_truth(drive, session)
     one, done = update_pass_state(builders, windows, estimate, PassState())
-    assert (one.phase, done, dict(one.rejected)) == ("robust", False, {})
+    assert (one.phase, done, dict(one.rejected)) == (Phase.ROBUST, False, {})
     two, done = update_pass_state(builders, windows, estimate, one)
-    assert (two.phase, done, dict(two.rejected)) == ("gated", False, {"gnss": frozenset({40})})
+    assert (two.phase, done, dict(two.rejected)) == (Phase.GATED, False, {"gnss": frozenset({40})})
     three, done = update_pass_state(builders, windows, estimate, two)
     assert (three, done) == (replace(two, stage=1), False)  # what needs the trajectory found joins
     assert update_pass_state(builders, windows, estimate, three) == (three, True)
@@ -231,7 +231,7 @@ def test_phases_follow_each_other(drive):
 
 def test_a_row_inside_the_gate_is_let_in_again(drive):
     builders, windows, estimate = at_truth(drive, with_fixes(drive, [1.0] * 3, told=[1.0] * 3))
-    rejected = PassState(phase="gated", rejected={"gnss": frozenset({5, 6})})
+    rejected = PassState(phase=Phase.GATED, rejected={"gnss": frozenset({5, 6})})
     learnt, done = update_pass_state(builders, windows, estimate, rejected)
     assert learnt.rejected["gnss"] == frozenset() and not done
 
