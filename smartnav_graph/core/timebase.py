@@ -85,6 +85,8 @@ def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> NDArray[np.intp]:
 
 # Rows between two straight stretches that make them one.
 MENDED_ROWS = 4
+MISSING_PERIODS = 3.0  # a step longer than so many median periods lacks samples
+STRAIGHT = 1e-3  # rad between successive differences on a straight line
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,13 @@ def find_gaps(
     values: Floats,
     *,
     missing_s: float = 0.05,
-    missing_periods: float = 3.0,
     bridged_rows: int = 5,
-    straightness: float = 1e-3,
 ) -> list[Gap]:
     """Find missing and straight-line-filled stretches of a sampled signal.
 
-    Missing: a step longer than both `missing_s` and `missing_periods` median periods.
+    Missing: a step longer than both `missing_s` and `MISSING_PERIODS` median periods.
     Bridged: at least `bridged_rows` successive rows that lie on one straight line of the k-dimensional signal space:
-    successive differences, each axis in units of its median step, are parallel within `straightness` rad, and every
+    successive differences, each axis in units of its median step, are parallel within `STRAIGHT` rad, and every
     axis moves from row to row (constant and quantised stretches do not count). No honest inertial sensor does that,
     and the rule does not depend on the stamps, which may be jittered. Stretches that a few rows part, as two that were
     swapped do, are one.
@@ -129,7 +129,7 @@ def find_gaps(
     if len(t_ns) < 2:
         return []
     dt = np.diff(t_ns) / NS
-    limit = max(missing_s, missing_periods * float(np.median(dt)))
+    limit = max(missing_s, MISSING_PERIODS * float(np.median(dt)))
     gaps = [Gap(int(t_ns[i]), int(t_ns[i + 1]), "missing") for i in np.flatnonzero(dt > limit)]
 
     step = np.diff(values, axis=0)
@@ -137,7 +137,7 @@ def find_gaps(
     step /= np.where(unit > 0, unit, 1.0)
     length = np.sqrt(np.einsum("ij,ij->i", step, step))
     cosine = np.einsum("ij,ij->i", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-300)
-    straight = cosine > np.cos(straightness)
+    straight = cosine > np.cos(STRAIGHT)
     moving = (step[1:] != 0.0).all(axis=1)
     padded = np.concatenate([[False], straight & moving, [False]])
     starts = np.flatnonzero(~padded[:-1] & padded[1:])

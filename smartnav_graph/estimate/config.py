@@ -40,9 +40,7 @@ class GapConfig:
     """What counts as a hole in the inertial data; see `timebase.find_gaps`."""
 
     missing_s: float = 0.05
-    missing_periods: float = 3.0
     bridged_rows: int = 5
-    straightness: float = 1e-3
 
 
 @dataclass(frozen=True)

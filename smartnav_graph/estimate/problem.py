@@ -23,7 +23,7 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.apply import corrected
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
-from smartnav_graph.session.detect.standstills import Standstills, find_standstills
+from smartnav_graph.session.detect.standstills import STANCE_SPACING_S, SWING_S, Standstills, find_standstills
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Positioned
@@ -91,15 +91,8 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     """
     imu = session.require_imu()
     signal = np.concatenate([imu.gyro, imu.accel], axis=1)
-    g = config.gaps
-    gaps = find_gaps(
-        imu.t_ns,
-        signal,
-        missing_s=g.missing_s,
-        missing_periods=g.missing_periods,
-        bridged_rows=g.bridged_rows,
-        straightness=g.straightness,
-    )
+    rule = config.gaps
+    gaps = find_gaps(imu.t_ns, signal, missing_s=rule.missing_s, bridged_rows=rule.bridged_rows)
     asked = _span(session, config)
     gaps = [gap for gap in gaps if gap.end_ns > asked[0] and gap.start_ns < asked[1]]
     checked = health.inspect(session, gaps)
@@ -143,11 +136,11 @@ def _calibrated(session: Session) -> Session:
 def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], dict[str, int]]:
     """The windows of a stretch, and how many rows of each stream are not known by its end."""
     session, causal = context.session, context.causal
-    spacing, still = context.config.keyframes, context.config.standstill
+    spacing = context.config.keyframes
     rests = context.rests or Standstills.none(session.require_imu().t_ns)
     if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
-        spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, still.swing_s))
-    standing = rests.keyframes(still.stance_s if rests.on_foot else None)
+        spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, SWING_S))
+    standing = rests.keyframes(STANCE_SPACING_S if rests.on_foot else None)
     merge = round(spacing.merge_s * NS)
     streams = session.absolute()
     aiding = {name: stream.t_ns for name, stream in streams.items()}

@@ -42,35 +42,33 @@ LEAST_SHARE = 0.5
 COMPRESSED = 3
 # What a pair's own pose takes of its matches.
 POSE_DOF = 5
+LEAST_MATCHES = 6  # of a pair
+LOSS_SCALE = 2.0  # of the Cauchy loss of a match, sigmas
 
 
 @dataclass(frozen=True)
 class CoplanarityConfig:
-    """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_matches,
-    least_parallax : of a pair (median once the turn is taken out), in sigmas of a match: noise alone makes 1.7; reach :
-    of the Cauchy loss of a match, sigmas; compress : settled pairs in nine rows; boresight_sigma_deg, time_offset_sigma
-    : deg and s, priors of the camera's attitude in the body and of its clock as states (zero: known; none given: as
-    sure as the calibration says); row_time : points are taken as seen when the row they lie in was read, where the
-    camera's readout is known."""
+    """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_parallax :
+    of a pair (median after the rotation is taken out), in sigmas of a match: noise alone makes 1.7;
+    boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's attitude in the body and of its clock as states (zero: known;
+    none given: that of the calibration); row_time : points are taken at the time when the row they lie in was read,
+    where the camera's readout is known."""
 
     enabled: bool = True
     rate_hz: float = 4.0
     spans: tuple[int, ...] = (1, 2, 4, 8)
-    least_matches: int = 6
     least_parallax: float = 3.0
-    reach: float = 2.0
-    compress: bool = True
     boresight_sigma_deg: float | None = None
     time_offset_sigma: float | None = None
     row_time: bool = True
 
     def __post_init__(self) -> None:
-        if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1 and self.least_matches >= POSE_DOF):
-            found = f"rate_hz = {self.rate_hz}, spans = {self.spans}, least_matches = {self.least_matches}"
-            raise ConfigError("config [coplanarity]", found, f"> 0, whole numbers >= 1, at least {POSE_DOF}")
+        if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1):
+            found = f"rate_hz = {self.rate_hz}, spans = {self.spans}"
+            raise ConfigError("config [coplanarity]", found, "> 0, whole numbers >= 1")
         given = (self.least_parallax, self.boresight_sigma_deg or 0.0, self.time_offset_sigma or 0.0)
-        if not (self.reach > 0 and min(given) >= 0):
-            raise ConfigError("config [coplanarity]", f"{self}", "reach > 0, parallax and sigmas >= 0")
+        if not min(given) >= 0:
+            raise ConfigError("config [coplanarity]", f"{self}", "parallax and sigmas >= 0")
 
 
 # Why a pair is not used, in words.
@@ -219,11 +217,11 @@ class CoplanarityBuilder:
     def _new_model(self, pass_state: PassState) -> RowModel:
         sigma = self.sigma * pass_state.scale(self.name)
         if pass_state.causal:
-            return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), self.config.reach)
+            return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), LOSS_SCALE)
         use, settled = self._padded_use(pass_state), pass_state.tests(self.name)
-        if settled == COMPRESSED and self.frozen is not None and self.config.compress:
-            return CompressedRows(self.pairs, self.rig, sigma, use, self.config.reach, self.frozen)
-        return PairRows(self.pairs, self.rig, sigma, use, self.config.reach)
+        if settled == COMPRESSED and self.frozen is not None:
+            return CompressedRows(self.pairs, self.rig, sigma, use, LOSS_SCALE, self.frozen)
+        return PairRows(self.pairs, self.rig, sigma, use, LOSS_SCALE)
 
     def _padded_use(self, pass_state: PassState) -> Mask:
         use = pass_state.used("matches", np.arange(len(self.pairs.pair)))
@@ -293,7 +291,7 @@ class CoplanarityBuilder:
         """Verdict (n,) by the matches in use (n, k) and the median parallax (n,) rad."""
         kept = use.sum(axis=1)
         share = kept / np.maximum(pairs.count, 1)
-        few = (pairs.count < self.config.least_matches) | ((share >= LEAST_SHARE) & (kept < self.config.least_matches))
+        few = (pairs.count < LEAST_MATCHES) | ((share >= LEAST_SHARE) & (kept < LEAST_MATCHES))
         still, contrary = parallax < self.config.least_parallax * self.sigma, share < LEAST_SHARE
         return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
 

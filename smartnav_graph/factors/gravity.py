@@ -38,27 +38,26 @@ from smartnav_graph.session.streams import ABSOLUTE
 
 # What holds tilt in the end: everything that knows position or velocity.
 HOLDS_TILT = (*ABSOLUTE, "velocity", "wheel")
+ALONE_S = 60.0  # time without any of them from which the force is used
+LEAST_SIGMA = 0.05  # m/s^2, of the mean force of a device at rest
+CLIMB = 0.5  # m/s, vertical speed of a person
+SHARE = 0.1  # of the scatter of the force: what does not average out
 
 
 @dataclass(frozen=True)
 class GravityConfig:
-    """enabled : ``auto`` (on foot, where no position, velocity or rest has come for `alone_s`), ``on``, ``off``;
-    stretch_s : over which the force is averaged; least_sigma m/s^2 : of a device at rest; speed m/s : of whoever moves,
-    along one axis, climb m/s : upwards; share : of the scatter of the force that does not average out."""
+    """enabled : ``auto`` (on foot, where no position, velocity or rest has come for `ALONE_S`), ``on``, ``off``;
+    stretch_s : over which the force is averaged; speed m/s : of a person, along one horizontal axis."""
 
     enabled: str = "auto"
-    alone_s: float = 60.0
     stretch_s: float = 4.0
-    least_sigma: float = 0.05
     speed: float = 1.4
-    climb: float = 0.5
-    share: float = 0.1
 
     def __post_init__(self) -> None:
         if self.enabled not in ("auto", "on", "off"):
             raise ConfigError("config [gravity]", f"enabled = {self.enabled!r}", "auto, on or off")
-        if not min(self.stretch_s, self.least_sigma, self.speed, self.climb, self.share, self.alone_s) > 0:
-            raise ConfigError("config [gravity]", "a length, sigma or share <= 0", "> 0")
+        if not min(self.stretch_s, self.speed) > 0:
+            raise ConfigError("config [gravity]", f"stretch_s = {self.stretch_s}, speed = {self.speed}", "> 0")
 
 
 class Upright:
@@ -142,7 +141,7 @@ class GravityBuilder:
         data = np.append(mean, self.sigma(mean - update.bias.accelerometer(), done.scatter, done.length_s))[None]
         keys = [(key("X", update.index), key("V", update.index), key("B", update.index))]
         update.blocks.append(FactorBatch(self.name, MODEL, keys, data, update.t_ns, loss="huber"))
-        pace = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.config.speed, self.config.speed, self.config.climb]))
+        pace = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.config.speed, self.config.speed, CLIMB]))
         update.add(FactorId("pace", update.t_ns), gtsam.PriorFactorVector(key("V", update.index), np.zeros(3), pace))
 
     def _alone(self, t_ns: int) -> bool:
@@ -150,7 +149,7 @@ class GravityBuilder:
             return True
         before = int(np.searchsorted(self.held_ns, t_ns, side="right"))
         since = self._begin_ns if before == 0 else int(self.held_ns[before - 1])
-        return t_ns - since > self.config.alone_s * NS
+        return t_ns - since > ALONE_S * NS
 
     def sigma(self, mean: Floats, scatter: float, length_s: float) -> float:
         """Sigma (m/s^2) of a mean force (3,) less bias, over `length_s` s, whose size scattered by `scatter` m/s^2.
@@ -158,7 +157,7 @@ class GravityBuilder:
         A force longer than gravity, sqrt(g^2 + a^2), tells an acceleration a; one off by a small e may as well be bias.
         """
         excess = max(abs(float(np.linalg.norm(mean)) - self.gravity) - BIAS_SLACK, 0.0)
-        parts = [self.config.least_sigma, self.config.share * scatter, np.sqrt(2.0 * self.gravity * excess)]
+        parts = [LEAST_SIGMA, SHARE * scatter, np.sqrt(2.0 * self.gravity * excess)]
         if scatter > REST_SCATTER:
             parts.append(np.sqrt(2.0) * self.config.speed / length_s)
         return float(np.linalg.norm(parts))

@@ -43,22 +43,21 @@ CALIBRATED_WEIGHT = 100.0
 
 @dataclass(frozen=True)
 class ImuConfig:
-    """integration_sigma : m/sqrt(s), error of the integration itself; gap_factor : on the noise found by bridging;
-    estimate_noise : find noise densities and bias walks from the kept data (batch); scale_sigma : prior of every
-    element of scale and misalignment as a state (0.01 is usual of phones; zero: calibrated, or none); turn_share : of a
-    window's turn that both may be off by in a replay, which neither has that state nor finds its noise."""
+    """integration_sigma : m/sqrt(s), error of the integration itself; estimate_noise : find noise densities and
+    bias walks from the kept data (batch); scale_sigma : prior of every element of scale and misalignment as a state
+    (0.01 is usual of phones; zero: calibrated, or none); scale_error_share : of a window's turn, that both may be off
+    by in a replay, which neither has that state nor finds its noise."""
 
     integration_sigma: float = 1e-3
-    gap_factor: float = 1.0
     estimate_noise: bool = True
     scale_sigma: float = 0.0
     scale_error_share: float = 0.005
 
     def __post_init__(self) -> None:
-        if not (self.integration_sigma > 0 and self.gap_factor > 0):
-            raise ConfigError("config [imu]", "integration_sigma or gap_factor <= 0", "> 0")
+        if not self.integration_sigma > 0:
+            raise ConfigError("config [imu]", f"integration_sigma = {self.integration_sigma}", "> 0")
         if self.scale_error_share < 0:
-            raise ConfigError("config [imu]", f"turn_share = {self.scale_error_share}", ">= 0")
+            raise ConfigError("config [imu]", f"scale_error_share = {self.scale_error_share}", ">= 0")
         if not 0 <= self.scale_sigma < 0.2:
             raise ConfigError("config [imu]", f"scale_sigma = {self.scale_sigma}", "between 0 and 0.2")
 
@@ -128,8 +127,8 @@ class ImuBuilder:
         accel = np.full(3, self.noise.accel_noise_density * scale_a)
         gyro = np.full(3, self.noise.gyro_noise_density * scale_g)
         if bridge is not None:
-            accel = np.maximum(accel, self.config.gap_factor * bridge.accel)
-            gyro = np.maximum(gyro, self.config.gap_factor * bridge.gyro)
+            accel = np.maximum(accel, bridge.accel)
+            gyro = np.maximum(gyro, bridge.gyro)
         params = gtsam.PreintegrationParams.MakeSharedU(self.gravity)
         params.setAccelerometerCovariance(np.diag(accel**2))
         params.setGyroscopeCovariance(np.diag(gyro**2))

@@ -36,24 +36,24 @@ from smartnav_graph.session.calibration.model import StepNoise
 from smartnav_graph.session.detect.steps import Steps, find_steps, regular_share
 
 WALK = 0.3  # share of regular steps from which a device that nothing is said of is in the hand of a walker
+GOOD_FIX_M = 0.3
 LEAST_UPRIGHT = 0.3  # least 1 + R_33: further from upright than 134 deg, yaw says little
 
 
 @dataclass(frozen=True)
 class StepConfig:
     """enabled : ``auto`` (in the hand of people on foot, or of a walker where no vehicle is declared), ``on`` or
-    ``off``; good_fix_m, spacing_s : fixes better and closer together than that carry the trajectory by themselves."""
+    ``off``; spacing_s : fixes better than `GOOD_FIX_M` and closer together than that determine the
+    trajectory by themselves."""
 
     enabled: str = "auto"
-    good_fix_m: float = 0.3
     spacing_s: float = 5.0
 
     def __post_init__(self) -> None:
         if self.enabled not in ("auto", "on", "off"):
             raise ConfigError("config [steps]", f"enabled = {self.enabled!r}", "auto, on or off")
-        if self.spacing_s < 0 or self.good_fix_m < 0:
-            found = f"spacing_s = {self.spacing_s}, good_fix_m = {self.good_fix_m}"
-            raise ConfigError("config [steps]", found, ">= 0")
+        if self.spacing_s < 0:
+            raise ConfigError("config [steps]", f"spacing_s = {self.spacing_s}", ">= 0 s")
 
 
 def level_yaw(R: Floats) -> Floats:
@@ -184,8 +184,8 @@ def build(context: FactorContext) -> StepBuilder | None:
 
 
 def _good_fixes(context: FactorContext) -> NDArray[np.int64]:
-    """Stamps (n,) of the fixes that are better than `good_fix_m`; those without a sigma have their class's."""
-    session, least = context.session, context.config.steps.good_fix_m
+    """Stamps (n,) of the fixes that are better than `GOOD_FIX_M`; those without a sigma have their class's."""
+    session = context.session
     found = [np.zeros(0, np.int64)]
     for stream, usual in (
         (session.gnss, context.calibration.gnss_noise.horizontal_sigma),
@@ -194,5 +194,5 @@ def _good_fixes(context: FactorContext) -> NDArray[np.int64]:
     ):
         if stream is not None:
             sigma = np.full((len(stream), 2), usual) if stream.sigma is None else stream.sigma[:, :2]
-            found.append(stream.t_ns[np.where(np.isfinite(sigma), sigma, usual).max(axis=1) < least])
+            found.append(stream.t_ns[np.where(np.isfinite(sigma), sigma, usual).max(axis=1) < GOOD_FIX_M])
     return np.sort(np.concatenate(found))

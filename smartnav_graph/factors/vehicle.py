@@ -42,31 +42,31 @@ MOUNT_SIZE = STATES["M"].dim
 # pass for its cause.
 RATE_S = 0.05
 FORCE_S = 0.6
+COMPLIANCE_SIGMA = 0.01  # rad per m/s^2, prior of the compliances
 
 
 @dataclass(frozen=True)
 class VehicleConfig:
     """enabled : use the constraint where a vehicle is declared; period_s : at most one row in so many seconds (slip and
-    springs are not white); mount_sigma_deg : prior of mount pitch and yaw beyond the declared axes; lever_sigma m and
-    compliance_sigma rad per m/s^2 : priors of the lever arms and compliances, around zero; loss : of a row, ``none``,
+    springs are not white); mount_sigma_deg : prior of mount pitch and yaw beyond the declared axes; lever_sigma m :
+    prior of the lever arms, around zero; loss : of a row, ``none``,
     ``huber`` or ``cauchy``."""
 
     enabled: bool = True
     period_s: float = 1.0
     mount_sigma_deg: float = 10.0
     lever_sigma: float = 1.5
-    compliance_sigma: float = 0.01
     loss: str = "huber"
 
     def __post_init__(self) -> None:
-        if not min(self.period_s, self.mount_sigma_deg, self.lever_sigma, self.compliance_sigma) > 0:
+        if not min(self.period_s, self.mount_sigma_deg, self.lever_sigma) > 0:
             raise ConfigError("config [vehicle]", "a period or sigma <= 0", "> 0")
         check_loss("vehicle", self.loss)
 
     @property
     def prior_sigma(self) -> Floats:
         """Sigma (8,) of the state M."""
-        turn, arm, soft = np.radians(self.mount_sigma_deg), self.lever_sigma, self.compliance_sigma
+        turn, arm, soft = np.radians(self.mount_sigma_deg), self.lever_sigma, COMPLIANCE_SIGMA
         return np.array([turn, turn, arm, arm, arm, arm, soft, soft])
 
 

@@ -15,12 +15,10 @@ from smartnav_graph.graph.pass_state import PassState
 @dataclass(frozen=True)
 class InitialiseConfig:
     """stretch_s : first windows used; max_stretch_s : how far the stretch grows while the heading stays open;
-    good_heading_deg : sigma that counts as known; starts : headings tried when it does not;
-    rest_s : shortest rest that counts."""
+    starts : headings tried; rest_s : shortest rest that counts."""
 
     stretch_s: float = 30.0
     max_stretch_s: float = 120.0
-    good_heading_deg: float = 10.0
     starts: int = 8
     rest_s: float = 1.0
 

@@ -54,6 +54,7 @@ LEVELLED = 0.1
 MAGNETIC_SIGMA = 0.35
 # A heading (rad) less sure than this is open.
 OPEN_SIGMA = 1.0
+GOOD_HEADING_DEG = 10.0  # a heading this sure is known
 KABSCH_S = (12.0, np.inf)
 
 
@@ -281,7 +282,7 @@ class Initialiser:
             stretch *= 2.0
 
     def _sure(self, initial: InitialState) -> bool:
-        return initial.sigma_heading_deg < self.config.good_heading_deg
+        return initial.sigma_heading_deg < GOOD_HEADING_DEG
 
     def _attempt(
         self,

@@ -66,17 +66,18 @@ SHORTEST_S = 0.03
 ARM = 0.03  # m from the point the foot turns about to the sensor
 # A foot swings faster (rad/s) and is set down harder (m/s^2 beside gravity) than what is carried; it stands in between.
 SWING_RATE, IMPACT, STAND_RATE, STAND_FORCE, STRIDE_S, STAND_SHARE = 4.0, 15.0, 1.0, 2.0, 1.5, 0.08
+# Longest windows (s) of a foot-mounted IMU in and between stances.
+STANCE_SPACING_S, SWING_S = 0.1, 0.2
 
 
 @dataclass(frozen=True)
 class StandstillConfig:
     """Zero velocity at standstills, and no turn where the device is truly at rest.
 
-    listed : use the periods of static.parquet; detect : find standstills in the inertial data
+    use_listed : use the periods of static.parquet; detect : find standstills in the inertial data
     standing : a walker who stands with the device in the hand has no velocity, within the hand's; never on wheels
     detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (by the data)
     zupt, zaru : zero velocity, zero turn; flat_floor : all stances are on one level, to floor_sigma m
-    stance_s, swing_s : longest windows of a foot-mounted IMU in and between stances
     """
 
     use_listed: bool = True
@@ -88,8 +89,6 @@ class StandstillConfig:
     zaru: bool = True
     flat_floor: bool = False
     floor_sigma: float = 0.02
-    stance_s: float = 0.1
-    swing_s: float = 0.2
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -98,8 +97,8 @@ class StandstillConfig:
         ):
             if value not in known:
                 raise ConfigError("config [standstill]", f"{name} = {value!r}", f"one of {', '.join(known)}")
-        if not (self.floor_sigma > 0 and self.stance_s > 0 and self.swing_s > 0):
-            raise ConfigError("config [standstill]", "floor_sigma, stance_s or swing_s <= 0", "> 0")
+        if not self.floor_sigma > 0:
+            raise ConfigError("config [standstill]", f"floor_sigma = {self.floor_sigma}", "> 0 m")
 
 
 @dataclass(frozen=True)

@@ -251,7 +251,7 @@ def test_stamps_of_keyframes():
     [
         ({"detector": "zvd"}, "detector = 'zvd'; expected one of shoe, are, amv"),
         ({"mounting": "hand"}, "mounting = 'hand'; expected one of auto, foot, body"),
-        ({"floor_sigma": 0.0}, "floor_sigma, stance_s or swing_s <= 0; expected > 0"),
+        ({"floor_sigma": 0.0}, "floor_sigma = 0.0; expected > 0 m"),
     ],
 )
 def test_wrong_options(options, told):
