@@ -51,7 +51,7 @@ def initialiser_of(problem: Problem, longest_s: float | None = None) -> Initiali
 def _standing(problem: Problem, shortest_s: float) -> int | None:
     """End of the standstill told of that the first keyframe lies in, if it lasts long enough."""
     start = problem.windows[0].t1_ns
-    spans = () if problem.rests is None else problem.rests.told
+    spans = () if problem.rests is None else problem.rests.confirmed
     ends = [b for a, b in spans if a <= start < b and b - start >= shortest_s * NS]
     return ends[0] if ends else None
 

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 
 from smartnav_graph import readers
+from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES
+from smartnav_graph.session.detect.stances import REST_SPEED, stance_speed
 from smartnav_graph.session.detect.standstills import (
     HAND_SPEED,
     LOOKAHEAD_S,
-    REST_SPEED,
     StandstillConfig,
     Standstills,
     find_standstills,
-    runs,
-    stance_speed,
 )
 from smartnav_graph.session.streams import Imu, StaticPeriod
 from smartnav_graph.simulation import motions
@@ -36,8 +35,8 @@ def ride(trajectory, noise=PHONE, seed=0, hertz=100.0):
     return imu(trajectory.sample(t), t_ns, noise, GRAVITY, np.random.default_rng(seed))[0]
 
 
-def found(samples, vehicle="none", use_listed=None, gaps=(), noise=PHONE, **options):
-    return find_standstills(samples, use_listed, gaps, vehicle, noise, GRAVITY, StandstillConfig(**options))
+def found(samples, vehicle="none", listed=None, gaps=(), noise=PHONE, **options):
+    return find_standstills(samples, listed, gaps, vehicle, noise, GRAVITY, StandstillConfig(**options))
 
 
 def seconds(spans):
@@ -71,8 +70,8 @@ def test_no_false_rest_on_wheels(scenario, seed):
     speed = np.linalg.norm(session.reference.velocity, axis=1)
     still = np.array([np.isfinite(rests.speed_at(int(t))) for t in at])
     assert speed[still].max(initial=0.0) < 0.1  # m/s: a wheel that begins to roll
-    use_listed = session.static
-    rest = [start for start, end in zip(use_listed.t_ns, use_listed.t_end_ns, strict=True) if end - start > 3 * NS]
+    listed = session.static
+    rest = [start for start, end in zip(listed.t_ns, listed.t_end_ns, strict=True) if end - start > 3 * NS]
     assert len(rest) > 0 and all(any(a - 2 * NS < r < b for a, b in rests.spans()) for r in rest)
 
 
@@ -97,14 +96,14 @@ def test_gaps_are_no_rest():
 def test_a_rest_holds_no_turn_only_where_the_data_say_so():
     # a listed stop during which the device is handled: no velocity, but turns
     trajectory = motions.figure_eight(20.0)
-    use_listed = StaticPeriod(t_ns=[8 * NS], t_end_ns=[10 * NS], sigma_v=[0.05])
-    rests = found(ride(trajectory), use_listed=use_listed)
+    listed = StaticPeriod(t_ns=[8 * NS], t_end_ns=[10 * NS], sigma_v=[0.05])
+    rests = found(ride(trajectory), listed=listed)
     assert rests.speed_at(9 * NS) == 0.05 and np.isnan(rests.over(rests.turn_sigma, 8 * NS, 10 * NS))
     assert np.isfinite(rests.over(rests.turn_sigma, NS, 3 * NS))  # the rest before
-    only = found(ride(trajectory), use_listed=use_listed, detect=False)
+    only = found(ride(trajectory), listed=listed, detect=False)
     assert seconds(only.spans()) == [(8.0, 10.0)] and not only.rests()
     assert not find_standstills(
-        ride(trajectory), use_listed, (), "none", PHONE, GRAVITY, StandstillConfig(use_listed=False, detect=False)
+        ride(trajectory), listed, (), "none", PHONE, GRAVITY, StandstillConfig(use_listed=False, detect=False)
     ).still.any()
 
 
