@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from smartnav_graph.readers import load as load
     from smartnav_graph.readers.reference import load_reference as load_reference
     from smartnav_graph.session.calibration.model import Calibration as Calibration
+    from smartnav_graph.session.folder import save as save
     from smartnav_graph.session.session import Session as Session
-    from smartnav_graph.session.session import save as save
     from smartnav_graph.simulation.scenarios import simulate as simulate
 
 # name -> module that holds it; imported when first asked for, so that the door itself costs nothing
@@ -72,7 +72,7 @@ _ROOMS = {
     "load": "readers",
     "load_reference": "readers.reference",
     "read_run": "output.run_folder",
-    "save": "session.session",
+    "save": "session.folder",
     "simulate": "simulation.scenarios",
     "write_run": "output.run_folder",
 }

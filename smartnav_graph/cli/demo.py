@@ -13,7 +13,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.estimate.config import Config, RunConfig
 from smartnav_graph.estimate.run import smooth
 from smartnav_graph.output.run_folder import write_run
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 
 MARK = ".smartnav-demo"
@@ -66,5 +66,5 @@ def claim(out: Path) -> None:
 
 def save(session: Session, path: Path) -> Session:
     """Write a session folder over an older one."""
-    session_model.save(session, path, force=True)
+    session_folder.save(session, path, force=True)
     return session.replace(path=path)

@@ -17,7 +17,7 @@ from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
 from smartnav_graph.output.run_folder import plain, read_run
 from smartnav_graph.readers.reference import load_reference
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision import benchmark as scores
@@ -125,7 +125,7 @@ class Match(Command):
 
     def _from_file(self, path: Path) -> None:
         folder = Path(self.session)
-        session = session_model.load(folder)
+        session = session_folder.load(folder)
         match_store.refuse_others(folder, "matches", self.force)
         name, camera = self._one_camera(session)
         rows = match_file.read(path)
@@ -140,7 +140,7 @@ class Match(Command):
         print(f"matches: {folder / 'matches.parquet'}")
 
     def _to_file(self, path: Path) -> None:
-        session = session_model.load(self.session)
+        session = session_folder.load(self.session)
         name, camera = self._one_camera(session)
         if session.images is None or session.matches is None:
             raise SessionError(self.session, "has no matches", "matches.parquet", "make them with `smartnav match`")
@@ -154,7 +154,7 @@ class Match(Command):
 
     def _map(self, path: Path) -> None:
         folder = Path(self.session)
-        session = session_model.load(folder)
+        session = session_folder.load(folder)
         match_store.refuse_others(folder, "pose_fixes", self.force)
         refuse_foreign_fixes(folder, session)
         known = own_fixes(session) if self.known is None else self._known(self.known, session)

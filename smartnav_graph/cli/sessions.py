@@ -12,7 +12,7 @@ from smartnav_graph.cli.options import Command, Repairs, SourceName, Switch, Tex
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
 from smartnav_graph.core.files import refuse_existing, refuse_foreign
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 
 HEADER = "session.toml"
 
@@ -52,7 +52,7 @@ class Import(Writing):
         with progress(self.quiet) as show:
             show(f"reading {self.source}", 0, 0)
             session = readers.read(self.source, self.format, repairs(self.repair))
-            session_model.save(session, self.out, force=self.force, progress=show)
+            session_folder.save(session, self.out, force=self.force, progress=show)
         print(session_text(session))
         print(f"session: {self.out}")
 

@@ -6,11 +6,15 @@ import os
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from smartnav_graph.core.arrays import Column, Table
 from smartnav_graph.core.errors import SessionError, SmartnavError
 
 
@@ -79,3 +83,27 @@ def refuse_foreign(path: str | Path, mark: str) -> None:
         raise SessionError(
             path, f"holds no {mark}, so it is not replaced", f"a new name or a folder with {mark}", "remove it yourself"
         )
+
+
+def write_table(columns: Mapping[str, Column], path: Path) -> None:
+    """Columns -> Parquet."""
+    pq.write_table(pa.table({name: pa.array(column) for name, column in columns.items()}), path)
+
+
+def read_table(path: Path) -> Table:
+    """Parquet -> columns; empty cells of number columns become NaN.
+
+    Raises
+    ------
+    SessionError
+        Missing, unreadable or empty file.
+    """
+    try:
+        table = pq.read_table(path)
+    except FileNotFoundError as error:
+        raise SessionError(path, "is missing", "a Parquet file", "check the path") from error
+    except (OSError, pa.ArrowException) as error:
+        raise SessionError(path, f"cannot be read ({error})", "a Parquet file", "import the log again") from error
+    if table.num_rows == 0:
+        raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
+    return {name: table.column(name).to_numpy() for name in table.column_names}

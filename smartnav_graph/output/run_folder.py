@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing
+from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing, write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate import config as config_model
@@ -31,7 +31,7 @@ from smartnav_graph.graph import solution as solution_model
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.output.export import write_trajectory_csv
 from smartnav_graph.session.calibration import model as calibration_model
-from smartnav_graph.session.session import Session, write_table
+from smartnav_graph.session.session import Session
 
 SUMMARY = "summary.json"
 UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")

@@ -24,7 +24,7 @@ from smartnav_graph.readers import (
 )
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.source import Reader
-from smartnav_graph.session import session
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 
 READERS: dict[str, Reader] = {
@@ -62,7 +62,7 @@ def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
     """
     folder = Path(source)
     ours = (folder / "session.toml").is_file() and not any(folder.glob("*.csv"))
-    return session.load(folder, repairs=repairs) if ours else read(source, repairs=repairs)
+    return session_folder.load(folder, repairs=repairs) if ours else read(source, repairs=repairs)
 
 
 def find(source: str | Path, name: str | None = None) -> Reader:

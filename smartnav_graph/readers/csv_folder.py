@@ -13,7 +13,8 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.source import Columns, Reader, build_session
 from smartnav_graph.readers.text import TextTable, read_text
 from smartnav_graph.session import repair
-from smartnav_graph.session.session import Session, read_header
+from smartnav_graph.session.folder import read_header
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import STREAMS, Stream
 
 NAME = "csv"

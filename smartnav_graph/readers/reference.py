@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.core.files import read_toml
+from smartnav_graph.core.files import read_table, read_toml
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Columns, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
-from smartnav_graph.session.session import build_stream, read_table
+from smartnav_graph.session.folder import build_stream
 from smartnav_graph.session.streams import Reference
 
 QUATERNION = ("qw", "qx", "qy", "qz")

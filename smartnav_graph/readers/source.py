@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.session.session import Mount, Session, build_stream
+from smartnav_graph.session.folder import build_stream
+from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.streams import STREAMS, Stream
 
 Columns = dict[str, NDArray[Any]]

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-import tomli_w
 from numpy.typing import NDArray
 
 from smartnav_graph.core import frames
-from smartnav_graph.core.errors import CalibrationError, SessionError
-from smartnav_graph.core.files import read_toml, replacing
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
-from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.core.timebase import NS, seconds_since
-from smartnav_graph.session import repair
-from smartnav_graph.session.calibration import model as calibration_model
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.streams import (
     ABSOLUTE,
@@ -231,148 +223,3 @@ class Session:
                 )
         arms = [self.mount(name or stream.NAME).body_t for name in names]
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
-
-
-def save(session: Session, path: str | Path, *, force: bool = False, progress: Progress = silent) -> None:
-    """Write a session folder: session.toml and one Parquet file a stream. Replaces nothing without `force`."""
-    with replacing(path, force=force) as folder:
-        folder.mkdir()
-        for name, stream in watched("writing streams", list(session.streams().items()), progress):
-            write_table(stream.columns(), folder / f"{name}.parquet")
-        if session.calibration is not None:
-            (folder / "calibration.toml").write_text(calibration_model.dumps(session.calibration), encoding="utf-8")
-        _copy_pictures(session, folder / PICTURES, progress)
-        (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
-
-
-def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
-    if session.images is None or session.pictures is None:
-        return
-    for file in watched("copying pictures", list(map(str, session.images.file)), progress):
-        source = session.pictures / file
-        if file and not Path(file).is_absolute() and source.is_file():
-            (folder / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(source, folder / file)
-
-
-def _header(session: Session) -> dict[str, Any]:
-    header: dict[str, Any] = {"schema": SCHEMA}
-    if session.gravity_m_s2 is not None:
-        header["gravity_m_s2"] = session.gravity_m_s2
-    if session.repairs:
-        header["repair"] = list(session.repairs)
-    header["device"] = dataclasses.asdict(session.device)
-    header["clock"] = {"epoch": session.clock_epoch}
-    if session.origin is not None:
-        header["origin"] = dataclasses.asdict(session.origin)
-    if session.sensors:
-        header["sensors"] = {name: dataclasses.asdict(mount) for name, mount in session.sensors.items()}
-    if session.calibration is not None:
-        header["calibration"] = "calibration.toml"
-    return header
-
-
-def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
-    """Columns -> Parquet."""
-    pq.write_table(pa.table({name: pa.array(column) for name, column in columns.items()}), path)
-
-
-def read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """Parquet -> columns; empty cells of number columns become NaN.
-
-    Raises
-    ------
-    SessionError
-        Missing, unreadable or empty file.
-    """
-    try:
-        table = pq.read_table(path)
-    except FileNotFoundError as error:
-        raise SessionError(path, "is missing", "a Parquet file", "check the path") from error
-    except (OSError, pa.ArrowException) as error:
-        raise SessionError(path, f"cannot be read ({error})", "a Parquet file", "import the log again") from error
-    if table.num_rows == 0:
-        raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
-    return {name: table.column(name).to_numpy() for name in table.column_names}
-
-
-def build_stream(
-    kind: type[Stream], table: Mapping[str, NDArray[Any]], where: Path | str, repairs: Iterable[str] = ()
-) -> tuple[Stream, dict[str, int]]:
-    """A checked stream of file columns, after the repairs asked for, with their counts; errors name the file."""
-    try:
-        rows, counts = repair.repair(kind, table, repairs)
-        return kind.from_columns(rows), counts
-    except SessionError as error:
-        raise error.located(where) from error
-    except (ValueError, TypeError) as error:
-        raise SessionError(where, f"a column holds no numbers ({error})", "numbers", stream=kind.NAME) from error
-
-
-def read_header(folder: Path) -> dict[str, Any]:
-    """session.toml as keyword arguments of Session (without streams)."""
-    path = folder / "session.toml"
-    if not path.exists():
-        raise SessionError(folder, "holds no session.toml", "a session folder", "make one with `smartnav import`")
-    raw = read_toml(path, SessionError, "a session.toml")
-    known = {"schema", "device", "clock", "origin", "gravity_m_s2", "sensors", "calibration", "repair"}
-    unknown = sorted(set(raw) - known)
-    if unknown:
-        raise SessionError(path, f"unknown key {', '.join(unknown)}", f"some of {', '.join(sorted(known))}")
-    if raw.get("schema", SCHEMA) != SCHEMA:
-        raise SessionError(path, f"schema = {raw['schema']}", f"{SCHEMA}", "import the log again with this version")
-    gravity = raw.get("gravity_m_s2")
-    if gravity is not None and not 9.0 < gravity < 10.5:
-        raise SessionError(path, f"gravity_m_s2 = {gravity}", "9.0 to 10.5 m/s^2", "give SI units")
-    try:
-        return {
-            "device": Device(**raw.get("device", {})),
-            "clock_epoch": raw.get("clock", {}).get("epoch", "unknown"),
-            "origin": Origin(**raw["origin"]) if raw.get("origin") else None,
-            "gravity_m_s2": gravity,
-            "sensors": {name: Mount(**_tuples(mount)) for name, mount in raw.get("sensors", {}).items()},
-            "calibration": calibration_model.load(folder / raw["calibration"]) if "calibration" in raw else None,
-            "repairs": repair.check_names(raw.get("repair", ())),
-        }
-    except TypeError as error:
-        raise SessionError(path, str(error), "the keys of the session format") from error
-    except (SessionError, CalibrationError) as error:
-        raise error.located(path) if isinstance(error, SessionError) else error from error
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
-
-
-def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
-    """Read a session folder.
-
-    Parameters
-    ----------
-    path : the folder
-    repairs : names of `smartnav_graph.session.repair` to apply beside those that session.toml asks for
-
-    Raises
-    ------
-    SessionError
-        Folder or file missing, unreadable or empty; wrong column; non-finite value; stamps not increasing.
-    """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise SessionError(folder, "is no folder", "a session folder", "make one with `smartnav import`")
-    header = read_header(folder)
-    wanted = repair.check_names({*header["repairs"], *repairs})
-    streams: dict[str, Stream] = {}
-    dropped: dict[str, dict[str, int]] = {}
-    for name, kind in STREAMS.items():
-        file = folder / f"{name}.parquet"
-        if file.exists():
-            streams[name], counts = build_stream(kind, read_table(file), file, wanted)
-            dropped |= {name: counts} if counts else {}
-    header["repairs"] = wanted
-    try:
-        return Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **header, **streams)  # type: ignore[arg-type]
-    except SessionError as error:
-        raise error.located(folder / f"{error.stream}.parquet" if error.stream else folder) from error

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.core.files import replacing
+from smartnav_graph.core.files import replacing, write_table
 from smartnav_graph.core.progress import Progress, silent
-from smartnav_graph.session import repair, session
+from smartnav_graph.session import folder as session_folder
+from smartnav_graph.session import repair
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import GnssFix, Imu, Reference
 from smartnav_graph.simulation import fixes
@@ -220,8 +221,8 @@ def write_degraded(
     faulty = degrade(whole, options, seed)
     repairs = repair.check_names({*faulty.repairs, *options.repairs})
     with replacing(path, force=force) as folder:
-        session.save(faulty.replace(repairs=repairs), folder, progress=progress)
+        session_folder.save(faulty.replace(repairs=repairs), folder, progress=progress)
         if options.repairs:
             table = spoil_rows(faulty.require_imu().columns(), options, seed)
-            session.write_table(table, folder / "imu.parquet")
+            write_table(table, folder / "imu.parquet")
     return faulty

@@ -22,7 +22,7 @@ from smartnav_graph.core.files import replacing
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
@@ -182,7 +182,7 @@ def write(
     progress("simulating", 0, 0)
     recorded = scenario(seed)
     with replacing(path, force=force) as folder:
-        session_model.save(recorded, folder, progress=progress)
+        session_folder.save(recorded, folder, progress=progress)
         if scenario.camera is not None and scenario.camera.pictures is not None:
             assert recorded.images is not None  # of the camera
             render.write(folder / "images", shots(scenario, seed), len(recorded.images), progress)

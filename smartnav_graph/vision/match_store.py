@@ -16,9 +16,9 @@ from typing import Any
 import tomli_w
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.files import replacing
+from smartnav_graph.core.files import replacing, write_table
 from smartnav_graph.core.progress import Progress, silent
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Stream
 from smartnav_graph.vision import images
@@ -46,7 +46,7 @@ def match(
         The session keeps others and `force` is not given; or as `front_end.find`.
     """
     folder, config = Path(path), config or FrontEndConfig()
-    session = session_model.load(folder)
+    session = session_folder.load(folder)
     name = "tracks" if config.tracks else "matches"
     wanted = asked(config) | {"inputs": _inputs(session, config, workers)}
     if (folder / f"{name}.parquet").exists() and not force:
@@ -62,7 +62,7 @@ def keep(folder: Path, stream: Stream | None, wanted: Mapping[str, Any], report:
     assert stream is not None
     file = folder / f"{stream.NAME}.parquet"
     with replacing(file) as new:
-        session_model.write_table(stream.columns(), new)
+        write_table(stream.columns(), new)
     told = {"asked": dict(wanted), "rows": _digest(file), "report": dict(report)}
     with replacing(file.with_suffix(".toml")) as new:
         new.write_text(tomli_w.dumps(told), encoding="utf-8")

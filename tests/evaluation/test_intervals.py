@@ -11,7 +11,7 @@ from smartnav_graph.cli import main
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.intervals import FIXES, FixesFromReference, intervals, with_fixes
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.session.streams import Reference
 from smartnav_graph.simulation import motions
@@ -112,7 +112,7 @@ def test_what_is_refused(walk):
 
 def test_the_command(walk, tmp_path, capsys):
     path = tmp_path / "walk"
-    session_model.save(walk, path)
+    session_folder.save(walk, path)
     made = ["--fixes-from-reference", "--fix-sigma", "0.01,0.5", "--seeds", "1", "--sensors", FIXES, "--quiet"]
     asked = ["intervals", str(path), "--every", "3", "--reference", str(path), *made]
     assert main([*asked, "--json"]) == 0
@@ -121,6 +121,6 @@ def test_the_command(walk, tmp_path, capsys):
     assert {"every_s", "kind", "seed", "n", "mean_m", "p67_m", "p95_m", "rmse_m"} <= set(rows[0])
     assert main(["intervals", str(path), "--every", "x", "--reference", str(path)]) == 1
     assert "--every: 'x'; expected numbers separated by commas" in capsys.readouterr().err
-    session_model.save(walk.replace(reference=None), tmp_path / "bare")
+    session_folder.save(walk.replace(reference=None), tmp_path / "bare")
     assert main(["intervals", str(tmp_path / "bare"), "--every", "1", "--reference", str(tmp_path / "bare")]) == 1
     assert "holds no reference" in capsys.readouterr().err

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from smartnav_graph.core.files import write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.graph import solution
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Residuals, Solution
-from smartnav_graph.session import session
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 T0 = 1_748_772_000_000_000_000
@@ -69,7 +69,7 @@ def test_blocks_of_the_covariance():
 
 def test_disk_and_back(tmp_path):
     s = example()
-    session.write_table(s.all_columns(), tmp_path / "solution.parquet")
+    write_table(s.all_columns(), tmp_path / "solution.parquet")
     back = solution.from_columns(
         solution.read(tmp_path / "solution.parquet"), t0_ns=s.t0_ns, origin=s.origin, forward=s.forward, up=s.up
     )

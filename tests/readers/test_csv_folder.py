@@ -9,7 +9,8 @@ import tomli_w
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import Origin
-from smartnav_graph.session.session import Device, Session, load, save
+from smartnav_graph.session.folder import load, save
+from smartnav_graph.session.session import Device, Session
 from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference, Stream
 
 T = np.array([1403715273262142976, 1403715273267142912, 1403715273272142976])

@@ -8,7 +8,7 @@ from smartnav_graph import readers
 from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.core.frames import axis_vector
 from smartnav_graph.readers.source import example_file
-from smartnav_graph.session.session import load, save
+from smartnav_graph.session.folder import load, save
 
 T_BS = """%YAML:1.0
 sensor_type: camera

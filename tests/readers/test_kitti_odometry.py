@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.session.session import load, save
+from smartnav_graph.session.folder import load, save
 
 CALIB = "P0: 7.0e+02 0 6.0e+02 0 0 7.1e+02 1.8e+02 0 0 0 1 0\n"
 # the second picture: a metre ahead, turned by 90 degrees to the right (about y, which points down)

@@ -9,7 +9,8 @@ from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.evaluation.align import fit
 from smartnav_graph.readers.reference import load_reference, load_transform
-from smartnav_graph.session.session import Session, save
+from smartnav_graph.session.folder import save
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Reference
 
 # forward-left-up body; the camera looks ahead, 1.1 m in front of and 0.7 m above the IMU

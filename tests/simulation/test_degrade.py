@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.session import session
+from smartnav_graph.core.files import read_table
+from smartnav_graph.session import folder as session_folder
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import GnssFix
 from smartnav_graph.simulation.degrade import Degrade, degrade, parse_outliers, parse_pair, spoil_rows, write_degraded
 from smartnav_graph.simulation.scenarios import simulate
@@ -24,7 +26,7 @@ def drive():
     """Ten minutes of fixes without noise, as a survey receiver gives them, in local metres without origin."""
     s = simulate("car-10min", 1)
     fix = GnssFix(t_ns=s.gnss.t_ns, enu=np.zeros((600, 3)))
-    return session.Session(imu=s.imu, gnss=fix)
+    return Session(imu=s.imu, gnss=fix)
 
 
 def test_white_noise_is_added_and_told_in_the_sigma(drive):
@@ -84,9 +86,9 @@ def test_adding_a_fault_leaves_the_others_as_they_were(drive):
 def test_row_faults_are_repaired_on_loading_with_exact_counts(walk, tmp_path):
     options = Degrade(duplicates=0.01, swaps=0.005, nan_rows=0.001)
     write_degraded(walk, options, 0, tmp_path / "bad")
-    raw = session.read_table(tmp_path / "bad" / "imu.parquet")
+    raw = read_table(tmp_path / "bad" / "imu.parquet")
     assert len(raw["t_ns"]) == N + 60 and sum(np.isnan(raw[c]).sum() for c in raw if c != "t_ns") == 6
-    back = session.load(tmp_path / "bad")
+    back = session_folder.load(tmp_path / "bad")
     assert back.repairs == ("nan", "order")
     assert back.dropped == {
         "imu": {"non-finite rows dropped": 6, "disordered rows sorted": 30, "repeated stamps dropped": 60}
@@ -103,7 +105,7 @@ def test_undeclared_row_faults_are_refused_by_name(walk, tmp_path):
         (Degrade(duplicates=0.001), "step 0 ns; 6 such rows"),
     ):
         with pytest.raises(SessionError, match=found):
-            session.build_stream(type(walk.imu), spoil_rows(walk.imu.columns(), options, 0), "imu.parquet")
+            session_folder.build_stream(type(walk.imu), spoil_rows(walk.imu.columns(), options, 0), "imu.parquet")
 
 
 def errors_ms(back, true):
@@ -120,10 +122,10 @@ def errors_ms(back, true):
 def test_jittered_stamps_are_rebuilt(walk, tmp_path, others):
     options = Degrade(jitter_ms=30.0, **others)
     valid = write_degraded(walk, options, 0, tmp_path / "bad")
-    raw = session.read_table(tmp_path / "bad" / "imu.parquet")
+    raw = read_table(tmp_path / "bad" / "imu.parquet")
     if not others:
         assert (raw["t_ns"] - walk.imu.t_ns).std() / 1e6 == pytest.approx(30.0, rel=0.05)
-    back = session.load(tmp_path / "bad")
+    back = session_folder.load(tmp_path / "bad")
     error = errors_ms(back.imu, walk.imu)
     assert np.sqrt((error**2).mean()) < 5.0  # ms
     rows = len(valid.imu) - round(options.nan_rows * N)
@@ -136,7 +138,7 @@ def test_jittered_stamps_are_rebuilt(walk, tmp_path, others):
 
 def test_stamps_of_other_streams_are_not_rebuilt(walk, tmp_path):
     write_degraded(walk, Degrade(jitter_ms=30.0), 0, tmp_path / "bad")
-    back = session.load(tmp_path / "bad")
+    back = session_folder.load(tmp_path / "bad")
     for name in ("gnss", "static", "reference", "magnetometer"):
         np.testing.assert_array_equal(getattr(back, name).t_ns, getattr(walk, name).t_ns)
     assert set(back.dropped) == {"imu"}
@@ -144,7 +146,7 @@ def test_stamps_of_other_streams_are_not_rebuilt(walk, tmp_path):
 
 def test_no_faults_change_nothing(walk, tmp_path):
     write_degraded(walk, Degrade(), 0, tmp_path / "same")
-    back = session.load(tmp_path / "same")
+    back = session_folder.load(tmp_path / "same")
     assert back.repairs == () and not back.dropped
     np.testing.assert_array_equal(back.imu.accel, walk.imu.accel)
 
@@ -162,9 +164,9 @@ def test_an_existing_folder_stays_unless_forced(walk, tmp_path):
     write_degraded(walk, Degrade(), 0, tmp_path / "s")
     with pytest.raises(SessionError, match="exists already"):
         write_degraded(walk, Degrade(swaps=0.01), 0, tmp_path / "s")
-    assert session.load(tmp_path / "s").repairs == ()
+    assert session_folder.load(tmp_path / "s").repairs == ()
     write_degraded(walk, Degrade(swaps=0.01), 0, tmp_path / "s", force=True)
-    assert session.load(tmp_path / "s").dropped["imu"] == {"disordered rows sorted": 60}
+    assert session_folder.load(tmp_path / "s").dropped["imu"] == {"disordered rows sorted": 60}
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.session import session
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation import cameras, recording, render
 from smartnav_graph.simulation.cameras import CameraModel, PictureModel
@@ -137,7 +137,7 @@ def test_textures_use_the_grey_levels_and_differ_by_seed():
 def test_a_written_scenario_has_its_pictures(tmp_path):
     short = replace(SCENARIO, seconds=0.4)
     made = recording.write(short, 0, tmp_path / "s")
-    back = session.load(tmp_path / "s")
+    back = session_folder.load(tmp_path / "s")
     assert back.images.file.tolist() == made.images.file.tolist() == [f"{i:06d}.png" for i in range(4)]
     pictures = [cv2.imread(str(tmp_path / "s" / "images" / name), cv2.IMREAD_UNCHANGED) for name in back.images.file]
     for picture, shown in zip(pictures, recording.shots(short, 0), strict=True):

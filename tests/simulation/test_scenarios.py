@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session import session
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.simulation.recording import magnetic_field_ut
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
 
@@ -188,8 +188,8 @@ def test_the_calibration_can_be_left_out():
 
 
 def test_a_simulated_session_survives_the_disk(tmp_path, sessions):
-    session.save(sessions["walk-60s"], tmp_path / "s")
-    back = session.load(tmp_path / "s")
+    session_folder.save(sessions["walk-60s"], tmp_path / "s")
+    back = session_folder.load(tmp_path / "s")
     assert back.calibration == sessions["walk-60s"].calibration and not back.dropped
     np.testing.assert_array_equal(back.reference.accel_bias, sessions["walk-60s"].reference.accel_bias)
 

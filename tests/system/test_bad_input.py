@@ -13,7 +13,7 @@ from sessions import on_control, recorded, shifted, truth, turned_deg, with_gnss
 import smartnav_graph as sn
 from smartnav_graph.core.errors import ConfigError, SessionError, SolverError
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.session import session as session_model
+from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.health import inspect
 from smartnav_graph.session.session import Mount
 from smartnav_graph.simulation import motions
@@ -181,7 +181,7 @@ def test_repaired_faults_cost_little(eight, clean, tmp_path):
     """Repeated, swapped, broken rows and jittered stamps, with repairs declared on disk."""
     faults = Degrade(duplicates=0.01, swaps=0.005, nan_rows=0.001, jitter_ms=3.0)
     write_degraded(eight, faults, 0, tmp_path / "faulty")
-    run = sn.run(session_model.load(tmp_path / "faulty"))
+    run = sn.run(session_folder.load(tmp_path / "faulty"))
     assert error_rms(eight, run.solution) < 1.15 * error_rms(eight, clean.solution)
     dropped = run.summary["dropped"]["imu"]
     assert dropped["non-finite rows dropped"] == 6 and dropped["stamps rebuilt"] > 5900

@@ -12,7 +12,7 @@ import smartnav_graph as sn
 from smartnav_graph.cli import main
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.output.run_folder import read_run
-from smartnav_graph.session.session import save as save_session
+from smartnav_graph.session.folder import save as save_session
 from smartnav_graph.session.streams import PoseFix
 from smartnav_graph.simulation.scenarios import simulate
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
-from smartnav_graph.session.session import Session, load, save
+from smartnav_graph.session.folder import load, save
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Images, Imu
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)

@@ -10,8 +10,8 @@ from scenes2d import CAMERA, centred, seen, session_of, texture
 import smartnav_graph as sn
 from smartnav_graph.cli import main
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import write_table
 from smartnav_graph.session.calibration import model as calibration_model
-from smartnav_graph.session.session import write_table
 from smartnav_graph.vision import match_store
 from smartnav_graph.vision.front_end import FrontEndConfig
 

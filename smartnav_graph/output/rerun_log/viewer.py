@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from smartnav_graph.core.errors import SessionError, SmartnavError
-from smartnav_graph.session.session import load
+from smartnav_graph.session.folder import load
 
 
 def recordings(paths: Iterable[str | Path], scratch: Path) -> list[Path]:

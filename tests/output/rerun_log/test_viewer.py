@@ -11,11 +11,11 @@ from recordings import (
 
 from smartnav_graph.core.errors import SessionError, SmartnavError
 from smartnav_graph.output.rerun_log import viewer
-from smartnav_graph.session import session as sessions
+from smartnav_graph.session import folder as session_folder
 
 
 def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):
-    sessions.save(make_session(), tmp_path / "session")
+    session_folder.save(make_session(), tmp_path / "session")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "run.rrd").write_bytes(b"")
     opened = []

@@ -93,6 +93,19 @@ def test_gaps_are_no_rest():
     assert seconds(rests.spans()) == [(0.0, pytest.approx(4.9, abs=0.4)), (pytest.approx(7.1, abs=0.4), 19.99)]
 
 
+@pytest.mark.parametrize(
+    ("mounting", "swing", "spin"),
+    [("body", 0.015, 0.0), ("foot", 0.06, 0.0), ("body", 0.0, 0.05), ("foot", 0.0, 0.05)],
+    ids=["swings", "foot swings", "spins", "foot spins"],
+)
+def test_a_device_that_turns_slowly_is_not_at_rest(mounting, swing, spin):
+    # rad/s, a sine of 1 Hz and a constant, a few times the limits; the force is gravity alone
+    still = ride(motions.static(20.0))
+    rate = np.outer(swing * np.sin(2 * np.pi * still.t_ns / NS) + spin, [0.0, 0.0, 1.0])
+    assert len(found(still, mounting=mounting).rests()) == 1
+    assert not found(replace(still, gyro=still.gyro + rate), mounting=mounting).rests()
+
+
 def test_a_rest_holds_no_turn_only_where_the_data_say_so():
     # a listed stop during which the device is handled: no velocity, but turns
     trajectory = motions.figure_eight(20.0)
