@@ -23,7 +23,8 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.apply import corrected
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
-from smartnav_graph.session.detect.standstills import STANCE_SPACING_S, SWING_S, Standstills, find_standstills
+from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
+from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Positioned
