@@ -1,4 +1,4 @@
-"""How far a solution strays between fixes, on the command line."""
+"""Drift between fixes (simulated outages), on the command line."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from smartnav_graph.session.streams import Reference
 
 @dataclass(frozen=True, kw_only=True)
 class Intervals(Asking):
-    """Replays the session with fixes every few seconds, and compares what was smoothed and what was foretold between
-    them with a reference: mean, 67 %, 95 % and RMS of the error.
+    """Drift between fixes (simulated outages): replays the session with fixes every few seconds, and compares the
+    smoothed and the predicted positions between them with a reference: mean, 67 %, 95 % and RMS of the error.
 
-    smoothed: all data; causal: known at that time; causal_end: just before the next fix.
+    smoothed: all data; causal: real-time estimate; causal_end: prediction before the next fix.
 
     Example: smartnav intervals walk --every 1,2,5 --reference walk --fixes-from-reference --fix-sigma 0.005,0.5
     """
@@ -37,11 +37,11 @@ class Intervals(Asking):
     reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """TUM, EuRoC ground truth, CSV with t, x, y, z named, or a session folder."""
     fixes_from_reference: Switch = False
-    """Make the fixes of the reference, with noise, instead of thinning the session's own."""
+    """Generate the fixes from the reference, with noise, instead of thinning the session's own."""
     fix_sigma: Annotated[str, tyro.conf.arg(metavar="M[,DEG]")] = "0.3,2"
     """Sigma of these fixes on each axis: position m, attitude deg (without it they have no attitude)."""
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.0
-    """How long after the time they speak of these fixes become known."""
+    """Latency of these fixes: how long after their time of measurement they become available."""
     seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """How many sets of these fixes, seeds 0 to N - 1."""
     json: Switch = False
@@ -51,9 +51,11 @@ class Intervals(Asking):
         session = readers.load(self.session, repairs=repairs(self.repair))
         reference = self._reference(session)
         every = numbers("--every", self.every)
-        made, config = self._made() if self.fixes_from_reference else None, self.resolved()
+        generated, config = self._generated() if self.fixes_from_reference else None, self.resolved()
         with progress(self.quiet) as show:
-            rows = intervals(session, reference, every, made=made, seeds=self.seeds, config=config, progress=show)
+            rows = intervals(
+                session, reference, every, generated=generated, seeds=self.seeds, config=config, progress=show
+            )
             found = list(rows)
         print(json.dumps(plain([r.to_dict() for r in found]), allow_nan=False) if self.json else intervals_text(found))
 
@@ -68,7 +70,7 @@ class Intervals(Asking):
             )
         return session.reference
 
-    def _made(self) -> FixesFromReference:
+    def _generated(self) -> FixesFromReference:
         if self.seeds < 1:
             raise ConfigError("--seeds", str(self.seeds), ">= 1")
         sigmas = numbers("--fix-sigma", self.fix_sigma)

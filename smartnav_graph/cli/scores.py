@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -69,17 +69,17 @@ def _offset(text: str) -> Any:
 
 def evaluation_text(found: Evaluation) -> str:
     """The figures of an evaluation for people."""
-    told = found.to_dict()
+    rotation = None if found.rotation_deg is None else asdict(found.rotation_deg)
     lines = [
         f"{found.solution} against {found.reference}: {found.matched} epochs matched, {found.unmatched} outside; "
         f"alignment {found.align}, time offset {found.time_offset_s:.4f} s",
-        statistics_line("position", "m", told["ape_m"]),
-        statistics_line("rotation", "deg", told["rotation_deg"]),
+        statistics_line("position", "m", asdict(found.ape_m)),
+        statistics_line("rotation", "deg", rotation),
     ]
     for row in found.rpe:
         if row.translation_m is not None:
             turn = "" if row.rotation_deg is None else f", {row.rotation_deg:.3f} deg"
             lines.append(f"over {row.delta_s:g} s{'':<4}{row.translation_m:.3f} m{turn} ({row.pairs} pairs)")
-    told_nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
-    lines += [f"NEES        {told_nees} (expected 3; yaw 1)"] if told_nees else []
+    nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
+    lines += [f"NEES        {nees} (expected 3; yaw 1)"] if nees else []
     return "\n".join([*lines, *found.notes])

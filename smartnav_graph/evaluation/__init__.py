@@ -1,4 +1,4 @@
-"""How well a solution agrees with a reference, and whether it knows how well: pure functions of the two."""
+"""Accuracy and consistency of a solution against a reference: pure functions of the two."""
 
 from smartnav_graph.evaluation.metrics import Evaluation, RelativeError, Statistics, evaluate
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import best_rotation
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
@@ -20,13 +19,13 @@ from smartnav_graph.session.streams import Reference
 
 METHODS = ("none", "yaw", "se3", "sim3")
 
-_SEARCH_ROWS = 2000  # reference rows the search for a time offset looks at; more change it by less than a millisecond
+_SEARCH_ROWS = 2000  # reference rows in the search for a time offset; more change it by less than a millisecond
 _RANK = 1e-13  # second singular value over the first, below which positions on a line differ by rounding alone
 _CANDIDATES = 5  # peaks of the speed correlation that are refined
 
 
 @dataclass(frozen=True)
-class Alignment:
+class FrameAlignment:
     """The similarity p_ref = scale R p_est + t; R (3, 3), t (3,) m."""
 
     R: Floats
@@ -45,20 +44,16 @@ class Alignment:
         """Aligned attitudes (n, 3, 3)."""
         return np.asarray(self.R @ rotations)
 
-    def covariance(self, blocks: Floats, *, scaled: bool = True) -> Floats:
-        """Aligned covariances (n, 3, 3); angles are not `scaled`."""
-        return np.asarray((self.scale**2 if scaled else 1.0) * self.R @ blocks @ self.R.T)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Track:
-    """Plain states at n times, of a solution or of a reference: what is not known is None.
+class StateSeries:
+    """States at n times, of a solution or of a reference; None where not available.
 
     t_ns (n,) on the solution's clock; position (n, 3) m; rotation (n, 3, 3) nav_R_body; velocity (n, 3) m/s;
     covariance (n, 9, 9) of rotation, position, velocity, nav axes; sigma (n, 3) m.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     position: Floats
     rotation: Floats | None = None
     velocity: Floats | None = None
@@ -68,61 +63,62 @@ class Track:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def take(self, rows: NDArray[np.bool_] | slice) -> Track:
+    def take(self, rows: Mask) -> StateSeries:
         """Only these rows."""
-        values: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
-        return Track(**chosen)
 
-    def inside(self, other: Track) -> NDArray[np.bool_]:
+        def part(values: Floats) -> Floats:
+            return values[rows]
+
+        return self._each(self.t_ns[rows], part, part)
+
+    def inside(self, other: StateSeries) -> Mask:
         """Mask of the rows that lie within the span of `other`."""
         return np.asarray((self.t_ns >= other.t_ns[0]) & (self.t_ns <= other.t_ns[-1]))
 
-    def at(self, t_ns: NDArray[np.int64]) -> Track:
+    def at(self, t_ns: Times) -> StateSeries:
         """Interpolated: linear, attitude by slerp. Covariances linear too, which keeps them positive definite."""
 
-        def rows(values: Floats | None) -> Floats | None:
-            if values is None:
-                return None
+        def between(values: Floats) -> Floats:
             flat = interpolate(t_ns, self.t_ns, values.reshape(len(self), -1))
             return flat.reshape(len(t_ns), *values.shape[1:])
 
-        position = rows(self.position)
-        assert position is not None
-        return Track(
+        return self._each(t_ns, between, lambda rotations: self._slerp(rotations, t_ns))
+
+    def _each(
+        self, t_ns: Times, change: Callable[[Floats], Floats], change_rotation: Callable[[Floats], Floats]
+    ) -> StateSeries:
+        return StateSeries(
             t_ns=t_ns,
-            position=position,
-            rotation=self._rotation_at(t_ns),
-            velocity=rows(self.velocity),
-            covariance=rows(self.covariance),
-            sigma=rows(self.sigma),
+            position=change(self.position),
+            rotation=None if self.rotation is None else change_rotation(self.rotation),
+            velocity=None if self.velocity is None else change(self.velocity),
+            covariance=None if self.covariance is None else change(self.covariance),
+            sigma=None if self.sigma is None else change(self.sigma),
         )
 
-    def _rotation_at(self, t_ns: NDArray[np.int64]) -> Floats | None:
-        if self.rotation is None:
-            return None
+    def _slerp(self, rotations: Floats, t_ns: Times) -> Floats:
         if len(self) == 1:
-            return np.repeat(self.rotation, len(t_ns), axis=0)
+            return np.repeat(rotations, len(t_ns), axis=0)
         t0 = int(self.t_ns[0])
         own, wanted = seconds_since(self.t_ns, t0), seconds_since(t_ns, t0)
-        slerp = Slerp(own, Rotation.from_matrix(self.rotation))
+        slerp = Slerp(own, Rotation.from_matrix(rotations))
         return np.asarray(slerp(np.clip(wanted, own[0], own[-1])).as_matrix())
 
 
-def track_of_solution(solution: Solution) -> Track:
-    """The states of a solution that a reference can speak of."""
-    chosen = np.r_[ROT, POS, VEL]
-    return Track(
+def states_of_solution(solution: Solution) -> StateSeries:
+    """Attitude, position and velocity of a solution."""
+    parts = np.r_[ROT, POS, VEL]
+    return StateSeries(
         t_ns=solution.t_ns,
         position=solution.nav_t_body,
         rotation=solution.nav_R_body,
         velocity=solution.nav_v_body,
-        covariance=solution.covariance[:, chosen[:, None], chosen],
+        covariance=solution.covariance[:, parts[:, None], parts],
     )
 
 
-def track_of_reference(reference: Reference, offset_ns: int) -> Track:
-    """The reference on the solution's clock: its stamp t speaks of solution time t + offset."""
+def states_of_reference(reference: Reference, offset_ns: int) -> StateSeries:
+    """The reference on the solution's clock: its stamp t is solution time t + offset."""
     rotation = None
     if reference.quat is not None:
         norm = np.linalg.norm(reference.quat, axis=1)
@@ -130,7 +126,7 @@ def track_of_reference(reference: Reference, offset_ns: int) -> Track:
             row = int(np.argmin(norm))
             raise SessionError("reference", f"qw..qz are all zero at row {row}", "unit quaternions", row=row)
         rotation = Rotation.from_quat(reference.quat[:, [1, 2, 3, 0]]).as_matrix()
-    return Track(
+    return StateSeries(
         t_ns=reference.t_ns + offset_ns,
         position=reference.enu,
         rotation=rotation,
@@ -139,7 +135,7 @@ def track_of_reference(reference: Reference, offset_ns: int) -> Track:
     )
 
 
-def check_overlap(estimate: Track, truth: Track, t0_ns: int, offset_s: float) -> None:
+def check_overlap(estimate: StateSeries, truth: StateSeries, t0_ns: int, offset_s: float) -> None:
     """Raise unless some reference stamps lie inside the run.
 
     Raises
@@ -153,7 +149,7 @@ def check_overlap(estimate: Track, truth: Track, t0_ns: int, offset_s: float) ->
     if truth.inside(estimate).any():
         return
 
-    def span(track: Track) -> str:
+    def span(track: StateSeries) -> str:
         first, last = seconds_since(track.t_ns[[0, -1]], t0_ns)
         return f"{first:.3f} to {last:.3f} s"
 
@@ -165,7 +161,7 @@ def check_overlap(estimate: Track, truth: Track, t0_ns: int, offset_s: float) ->
     )
 
 
-def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
+def fit_alignment(method: str, estimate: Floats, truth: Floats) -> FrameAlignment:
     """Alignment of positions (n, 3) that minimises sum |p_ref - (scale R p_est + t)|^2.
 
     ``yaw`` turns about the vertical only: psi = atan2(sum x_e y_n - x_n y_e, sum x_e y_e + x_n y_n) over centred
@@ -178,7 +174,7 @@ def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
         Unknown method, or positions that do not determine the rotation (standing still, or along a line).
     """
     if method == "none":
-        return Alignment(np.eye(3), np.zeros(3))
+        return FrameAlignment(np.eye(3), np.zeros(3))
     if method == "yaw":
         return _fit_yaw(estimate, truth)
     if method not in METHODS:
@@ -188,18 +184,18 @@ def fit(method: str, estimate: Floats, truth: Floats) -> Alignment:
         raise _degenerate(method, len(truth), "positions that span a plane")
     centre = estimate.mean(axis=0)
     scale = float(singular.sum() / ((estimate - centre) ** 2).sum()) if method == "sim3" else 1.0
-    return Alignment(R, truth.mean(axis=0) - scale * R @ centre, scale)
+    return FrameAlignment(R, truth.mean(axis=0) - scale * R @ centre, scale)
 
 
-def _fit_yaw(estimate: Floats, truth: Floats) -> Alignment:
+def _fit_yaw(estimate: Floats, truth: Floats) -> FrameAlignment:
     centre, target = estimate.mean(axis=0), truth.mean(axis=0)
     x, y = estimate - centre, truth - target
     sine = float((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum())
     cosine = float((x[:, :2] * y[:, :2]).sum())
     if np.hypot(sine, cosine) < 1e-12 * len(x):
-        raise _degenerate("yaw", len(truth), "two different places at least")
+        raise _degenerate("yaw", len(truth), "at least two different places")
     R = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()
-    return Alignment(R, target - R @ centre)
+    return FrameAlignment(R, target - R @ centre)
 
 
 def _degenerate(method: str, count: int, rule: str) -> SessionError:
@@ -224,9 +220,9 @@ def find_time_offset(solution: Solution, reference: Reference, method: str) -> f
     Raises
     ------
     SessionError
-        No candidate: the speeds tell nothing and the spans do not overlap.
+        No candidate: the speeds do not vary and the spans do not overlap.
     """
-    estimate, truth = track_of_solution(solution), track_of_reference(reference, 0)
+    estimate, truth = states_of_solution(solution), states_of_reference(reference, 0)
     step_s = _grid_step(estimate, truth)
     results = []
     for coarse in _candidates(estimate, truth, step_s):
@@ -236,22 +232,22 @@ def find_time_offset(solution: Solution, reference: Reference, method: str) -> f
             results.append((float(best.fun), coarse + float(best.x)))
     if not results:
         check_overlap(estimate, truth, solution.t0_ns, 0.0)
-        raise SessionError("--time-offset auto", "no offset can be told from this run", remedy="give it in seconds")
+        raise SessionError("--time-offset auto", "the offset is not observable", remedy="give it in seconds")
     return min(results)[1]
 
 
-def _grid_step(estimate: Track, truth: Track) -> float:
+def _grid_step(estimate: StateSeries, truth: StateSeries) -> float:
     periods = [float(np.median(np.diff(track.t_ns))) / NS for track in (estimate, truth) if len(track) > 1]
     return float(np.clip(max(periods, default=0.1), 0.05, 1.0))
 
 
-def _speed(track: Track, step_s: float) -> Floats:
+def _speed(track: StateSeries, step_s: float) -> Floats:
     grid = track.t_ns[0] + np.arange(0, track.t_ns[-1] - track.t_ns[0], round(step_s * NS))
     position = interpolate(grid, track.t_ns, track.position)
     return np.asarray(np.linalg.norm(np.diff(position, axis=0), axis=1) / step_s)
 
 
-def _candidates(estimate: Track, truth: Track, step_s: float) -> list[float]:
+def _candidates(estimate: StateSeries, truth: StateSeries, step_s: float) -> list[float]:
     out = [0.0] if truth.inside(estimate).any() else []
     a, b = _speed(estimate, step_s), _speed(truth, step_s)
     if min(len(a), len(b)) < 4:
@@ -282,11 +278,11 @@ def _correlate(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _cost(
-    estimate: Track, truth: Track, method: str, coarse_s: float, reach_s: float
+    estimate: StateSeries, truth: StateSeries, method: str, coarse_s: float, margin_s: float
 ) -> Callable[[float], float] | None:
-    """RMS position difference as a function of seconds beside `coarse_s`, over rows inside the run for all of them."""
-    t_ns, reach = truth.t_ns + round(coarse_s * NS), round(reach_s * NS)
-    rows = np.flatnonzero((t_ns - reach >= estimate.t_ns[0]) & (t_ns + reach <= estimate.t_ns[-1]))
+    """RMS position difference by the offset beyond `coarse_s`; the rows are inside the run for all up to `margin_s`."""
+    t_ns, margin = truth.t_ns + round(coarse_s * NS), round(margin_s * NS)
+    rows = np.flatnonzero((t_ns - margin >= estimate.t_ns[0]) & (t_ns + margin <= estimate.t_ns[-1]))
     if len(rows) < 3:
         return None
     rows = rows[:: -(-len(rows) // _SEARCH_ROWS)]
@@ -294,7 +290,7 @@ def _cost(
 
     def rms(extra_s: float) -> float:
         position = interpolate(stamps + round(extra_s * NS), estimate.t_ns, estimate.position)
-        difference = fit(method, position, target).position(position) - target
+        difference = fit_alignment(method, position, target).position(position) - target
         return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
     return rms

@@ -1,20 +1,19 @@
-"""How far two solutions of one session are apart, and what else differs between two runs."""
+"""Differences between two solutions of one session, and between the summaries of two runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import interpolate, seconds_since
-from smartnav_graph.evaluation.align import Track, track_of_solution
+from smartnav_graph.evaluation.align import StateSeries, states_of_solution
 from smartnav_graph.evaluation.metrics import Statistics
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Solution
 
@@ -22,7 +21,7 @@ DEG = float(np.degrees(1.0))
 
 
 class Measure(NamedTuple):
-    """Components of the state whose difference is told as one magnitude, in a unit `factor` times smaller than SI."""
+    """Components of the state whose difference has one magnitude, in a unit `factor` times smaller than SI."""
 
     name: str
     components: slice
@@ -43,7 +42,7 @@ MEASURES = (
 
 
 @dataclass(frozen=True)
-class Apart:
+class DifferenceStatistics:
     """Magnitudes of one difference: statistics, when it is largest, that largest one in sigmas (the larger of the two
     runs'), and the median ratio of the sigmas, second over first."""
 
@@ -61,7 +60,7 @@ class Comparison:
     velocity in nav axes, biases in body axes; position (n, 3) of the first, m; sigma_first, sigma_second (n, 15)
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     t0_ns: int
     position: Floats
     difference: Floats
@@ -80,7 +79,7 @@ class Comparison:
         """Magnitudes (n,) of the difference in the measure's unit."""
         return np.asarray(np.linalg.norm(self.difference[:, measure.components], axis=1) * measure.factor)
 
-    def apart(self, measure: Measure) -> Apart:
+    def statistics(self, measure: Measure) -> DifferenceStatistics:
         """The figures of one measure."""
         magnitude = self.magnitude(measure)
         first, second = (
@@ -88,20 +87,20 @@ class Comparison:
             for sigma in (self.sigma_first, self.sigma_second)
         )
         at = int(magnitude.argmax())
-        return Apart(
+        return DifferenceStatistics(
             statistics=Statistics.of(magnitude),
             largest_at_s=float(self.seconds[at]),
             largest_sigmas=float(magnitude[at] / max(first[at], second[at])),
             sigma_ratio=float(np.median(second / first)),
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The figures of every measure."""
-        told: dict[str, Any] = {"epochs": len(self)}
+        figures: dict[str, object] = {"epochs": len(self)}
         for measure in MEASURES:
-            figures = asdict(self.apart(measure))
-            told[measure.name] = figures.pop("statistics") | figures
-        return told
+            found = asdict(self.statistics(measure))
+            figures[measure.name] = found.pop("statistics") | found
+        return figures
 
     def largest(self, count: int, apart_s: float) -> list[int]:
         """Rows of the largest differences of position, each `apart_s` from those before it."""
@@ -123,7 +122,7 @@ def compare(first: Solution, second: Solution) -> Comparison:
     SessionError
         They have no time in common.
     """
-    one, other = track_of_solution(first), track_of_solution(second)
+    one, other = states_of_solution(first), states_of_solution(second)
     common = np.isin(one.t_ns, other.t_ns)
     rows = common if common.sum() >= 2 else one.inside(other)
     inside = one.take(rows)
@@ -135,7 +134,7 @@ def compare(first: Solution, second: Solution) -> Comparison:
         t_ns=inside.t_ns,
         t0_ns=first.t0_ns,
         position=inside.position,
-        difference=np.concatenate([_moved(inside, at), bias - _biases(first)[rows]], axis=1),
+        difference=np.concatenate([_differences(inside, at), bias - _biases(first)[rows]], axis=1),
         sigma_first=first.sigmas[rows],
         sigma_second=sigma,
     )
@@ -145,55 +144,57 @@ def _biases(solution: Solution) -> Floats:
     return np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
 
 
-def _moved(one: Track, other: Track) -> Floats:
-    """Rotation, position and velocity (n, 9) from one track to the other."""
+def _differences(one: StateSeries, other: StateSeries) -> Floats:
+    """Rotation, position and velocity (n, 9) from one series to the other."""
     assert one.rotation is not None and other.rotation is not None  # of solutions
     assert one.velocity is not None and other.velocity is not None
     turn = Rotation.from_matrix(other.rotation @ one.rotation.transpose(0, 2, 1)).as_rotvec()
     return np.concatenate([turn, other.position - one.position, other.velocity - one.velocity], axis=1)
 
 
-def rejected_sets(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def rejected_sets(first: Mapping[str, object], second: Mapping[str, object]) -> dict[str, dict[str, object]]:
     """By sensor, rows that both runs rejected and that only one of them did, of two tables of summary.json."""
 
-    def rows(summary: Mapping[str, Any]) -> dict[str, set[int]]:
+    def rows(summary: Mapping[str, object]) -> dict[str, set[int]]:
         found: dict[str, set[int]] = {}
-        for one in summary.get("rejections", ()):
+        rejections = summary.get("rejections")
+        for one in rejections if isinstance(rejections, Sequence) else ():
             found.setdefault(str(one["sensor"]), set()).add(int(one["row"]))
         return found
 
     one, other = rows(first), rows(second)
-    told = {}
+    sets: dict[str, dict[str, object]] = {}
     for name in sorted({*one, *other}):
         a, b = one.get(name, set()), other.get(name, set())
-        told[name] = {"both": len(a & b), "only_first": sorted(a - b), "only_second": sorted(b - a)}
-    return told
+        sets[name] = {"both": len(a & b), "only_first": sorted(a - b), "only_second": sorted(b - a)}
+    return sets
 
 
-# Figures of summary.json that tell two runs apart, beside those of sensors and states; a dot goes into a table.
+# Figures of summary.json that are compared, beside those of sensors and states; "a.b" is b of table a.
 FIGURES = (
     *("mode", "vehicle", "duration_s", "path_m", "keyframes", "chi2_per_dof.overall", "iterations", "passes"),
     *("converged", "position_sigma_m.median", "position_sigma_m.p95", "position_sigma_m.max", "timings_s.total"),
 )
 
 
-def figure_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def figure_differences(first: Mapping[str, object], second: Mapping[str, object]) -> dict[str, tuple[object, object]]:
     """Figures that differ between two tables of summary.json: path -> the value of each, None where it has none."""
     one, other = _figures(first), _figures(second)
     names = [*one, *(name for name in other if name not in one)]
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
 
 
-def _figures(summary: Mapping[str, Any]) -> dict[str, Any]:
+def _figures(summary: Mapping[str, object]) -> dict[str, object]:
     found = {name: value for name in FIGURES if (value := _at(summary, name)) is not None}
-    for room, field in (("used", ""), ("rejected", ""), ("withheld", "rms_horizontal_m"), ("states", "value")):
-        for name, value in dict(summary.get(room, {})).items():
-            found[f"{room}.{name}"] = value.get(field) if field else value
+    for group, field in (("used", ""), ("rejected", ""), ("withheld", "rms_horizontal_m"), ("states", "value")):
+        table = summary.get(group)
+        for name, value in table.items() if isinstance(table, Mapping) else ():
+            found[f"{group}.{name}"] = value.get(field) if field else value
     return found
 
 
-def _at(summary: Mapping[str, Any], path: str) -> Any:
-    value: Any = summary
+def _at(summary: Mapping[str, object], path: str) -> object:
+    value: object = summary
     for name in path.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
     return value

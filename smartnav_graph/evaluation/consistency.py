@@ -1,4 +1,4 @@
-"""Is the covariance honest? Normalised estimation error squared and its chi-square bounds.
+"""Consistency of the covariance: normalised estimation error squared (NEES) and its chi-square bounds.
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 5.4.
 """
@@ -6,16 +6,16 @@ Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Trac
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
     """Normalised estimation error squared, e^T P^-1 e, of every row.
 
-    Expected value k (the dimension) where the covariance is honest; above it is over-confident.
+    Expected value k (the dimension) where the covariance is right; a larger mean means that it is too small.
 
     Parameters
     ----------
@@ -29,8 +29,8 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
     e = np.asarray(errors, dtype=np.float64)
     P = np.asarray(covariances, dtype=np.float64)
     out = np.full(len(e), np.nan)
-    good: NDArray[np.bool_] = np.asarray(np.isfinite(P).all(axis=(1, 2)))
-    # eigvalsh tells indefinite matrices apart without raising for the whole stack, as a Cholesky would
+    good: Mask = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    # eigvalsh finds indefinite matrices without raising for the whole stack, as a Cholesky would
     good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
     out[good] = np.einsum("ni,ni->n", e[good], np.linalg.solve(P[good], e[good][:, :, None])[:, :, 0])
     return out

@@ -1,23 +1,22 @@
-"""How far the solution strays between fixes that come every few seconds.
+"""Drift between fixes (simulated outages).
 
-For each spacing the fixes are thinned to it (or made of the reference, with noise), the session is replayed and then
-smoothed, and both are compared with the reference rows in between:
+For each spacing the fixes are thinned to it (or generated from the reference, with noise), the session is replayed and
+then smoothed, and both are compared with the reference rows in between:
 
-    smoothed     the final smoothed solution at every reference row that is no fix itself
-    causal       what was known at that time: inertial prediction from the latest keyframe
-    causal_end   the same just before the next fix becomes known, once an interval
+    smoothed     the final smoothed solution at every reference row that is not a fix
+    causal       the real-time estimate at that time: inertial prediction from the latest keyframe
+    causal_end   the same just before the next fix becomes available, once an interval
 
-Causal kinds count from the end of the stretch that the replay's initialisation looks at: before, nothing is known.
+The causal kinds begin after the initialisation of the replay.
 
-A reference of which the fixes were made is one with the sensor that gave them: its rows are scored through that
-sensor's own model, at t + time offset, with its lever arm (see `assemble.score`).
+A reference from which the fixes were generated has the sensor model of these fixes: its rows are compared at
+t + time offset, with the lever arm (see `assemble.score_holdout`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,15 +34,15 @@ from smartnav_graph.graph.interpolate import foretold_at
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import ABSOLUTE, PoseFix, Reference
 
-# A fix is made of the reference row nearest to its time, where one is this near, s.
+# Largest time between a fix and the reference row from which it is generated, s.
 NEAR_S = 0.1
 FIXES = "pose_fixes"
 
 
 @dataclass(frozen=True)
 class FixesFromReference:
-    """Fixes made of the reference: Gaussian errors of `sigma_m` and `sigma_deg` on each axis (no attitude where
-    `sigma_deg` is None), known `latency_s` after the time they speak of."""
+    """Fixes generated from the reference: Gaussian errors of `sigma_m` and `sigma_deg` on each axis (no attitude where
+    `sigma_deg` is None), available `latency_s` after their time of measurement."""
 
     sigma_m: float
     sigma_deg: float | None = None
@@ -79,13 +78,11 @@ class Interval:
     @classmethod
     def of(cls, every_s: float, kind: str, seed: int, error: Floats) -> Interval:
         """Of errors (n, 3) m, nav axes."""
-        figures: dict[str, Any] = {}
-        for prefix, rows in (("", error), ("horizontal_", error[:, :2])):
-            found = Statistics.of(np.linalg.norm(rows, axis=1))
-            figures |= {f"{prefix}{name}_m": getattr(found, name) for name in ("mean", "p67", "p95", "rmse")}
-        return cls(every_s, kind, seed, len(error), **figures)
+        space, plan = (Statistics.of(np.linalg.norm(rows, axis=1)) for rows in (error, error[:, :2]))
+        figures = [(one.mean, one.p67, one.p95, one.rmse) for one in (space, plan)]
+        return cls(every_s, kind, seed, len(error), *figures[0], *figures[1])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, float | int | str]:
         return asdict(self)
 
 
@@ -94,19 +91,19 @@ def intervals(
     reference: Reference,
     every_s: Sequence[float],
     *,
-    made: FixesFromReference | None = None,
+    generated: FixesFromReference | None = None,
     seeds: int = 1,
     config: Config | None = None,
     progress: Progress = silent,
 ) -> Iterator[Interval]:
-    """Three kinds of error for every spacing and seed, as they are found.
+    """Three kinds of error for every spacing and seed, as they are computed.
 
     Parameters
     ----------
-    session : with fixes of its own, or any with `made`
+    session : with fixes of its own, or any with `generated`
     reference : trajectory in the same frame, on the session's clock
     every_s : spacings of the fixes, s
-    made : make the fixes of the reference, one set a seed (0, 1, ...); the session's own are left out
+    generated : generate the fixes from the reference, one set a seed (0, 1, ...); the session's own are left out
     config : options of the replay
 
     Raises
@@ -117,16 +114,18 @@ def intervals(
     wrong = [spacing for spacing in every_s if not spacing > 0]
     if wrong:
         raise ConfigError("--every", f"{wrong[0]}", "spacings > 0 s")
-    runs = [(spacing, seed) for spacing in every_s for seed in range(seeds if made is not None else 1)]
+    runs = [(spacing, seed) for spacing in every_s for seed in range(seeds if generated else 1)]
     for count, (spacing, seed) in enumerate(runs, 1):
-        fixed = with_fixes(session, reference, spacing, made, seed) if made else _thinned(session, spacing)
+        fixed = with_fixes(session, reference, spacing, generated, seed) if generated else _thinned(session, spacing)
         watch = under(f"run {count} of {len(runs)}", progress)
         run = replay(fixed, _at_keyframes(config or Config()), progress=watch)
-        yield from _scored(run, reference, spacing, seed, made is not None)
+        yield from _scored(run, reference, spacing, seed, bool(generated))
 
 
-def with_fixes(session: Session, reference: Reference, every_s: float, made: FixesFromReference, seed: int) -> Session:
-    """The session with no other absolute stream than fixes made of the reference."""
+def with_fixes(
+    session: Session, reference: Reference, every_s: float, generated: FixesFromReference, seed: int
+) -> Session:
+    """The session with fixes generated from the reference as its only absolute stream."""
     imu = session.require_imu()
     inside = np.flatnonzero((reference.t_ns >= imu.t_ns[0]) & (reference.t_ns <= imu.t_ns[-1]))
     if not len(inside):
@@ -135,27 +134,27 @@ def with_fixes(session: Session, reference: Reference, every_s: float, made: Fix
     grid = np.arange(int(truth.t_ns[0]), int(truth.t_ns[-1]) + 1, round(every_s * NS))
     rows = nearest(grid, truth.t_ns)
     rows = np.unique(rows[np.abs(truth.t_ns[rows] - grid) <= NEAR_S * NS])
-    streams: dict[str, Any] = {**dict.fromkeys(ABSOLUTE), FIXES: _noisy(truth.take(rows), made, seed)}
-    return _checked(session.replace(**streams), every_s)
+    others = dict.fromkeys(set(ABSOLUTE) - {FIXES})
+    return _checked(session.replace(**others, pose_fixes=_noisy(truth.take(rows), generated, seed)), every_s)
 
 
-def _noisy(truth: Reference, made: FixesFromReference, seed: int) -> PoseFix:
+def _noisy(truth: Reference, generated: FixesFromReference, seed: int) -> PoseFix:
     rng, n = np.random.default_rng(seed), len(truth)
-    columns: dict[str, Any] = {
-        "t_ns": truth.t_ns,
-        "enu": truth.enu + made.sigma_m * rng.standard_normal((n, 3)),
-        "sigma": np.full((n, 3), made.sigma_m),
-    }
-    turns = rng.standard_normal((n, 3))
-    if made.sigma_deg is not None:
-        if truth.quat is None:
-            raise SessionError("reference", "has no attitude", "qw, qx, qy, qz", "give --fix-sigma without degrees")
-        sigma = np.radians(made.sigma_deg)
-        found = Rotation.from_rotvec(sigma * turns) * Rotation.from_quat(truth.quat[:, [1, 2, 3, 0]])
-        columns |= {"quat": found.as_quat(canonical=True)[:, [3, 0, 1, 2]], "sigma_rot": np.full((n, 3), sigma)}
-    if made.latency_s > 0:
-        columns["arrival_ns"] = truth.t_ns + round(made.latency_s * NS)
-    return PoseFix(**columns)
+    position, attitude = rng.standard_normal((n, 3)), rng.standard_normal((n, 3))
+    fixes = PoseFix(
+        t_ns=truth.t_ns,
+        enu=truth.enu + generated.sigma_m * position,
+        sigma=np.full((n, 3), generated.sigma_m),
+        arrival_ns=truth.t_ns + round(generated.latency_s * NS) if generated.latency_s > 0 else None,
+    )
+    if generated.sigma_deg is None:
+        return fixes
+    if truth.quat is None:
+        raise SessionError("reference", "has no attitude", "qw, qx, qy, qz", "give --fix-sigma without degrees")
+    sigma = np.radians(generated.sigma_deg)
+    found = Rotation.from_rotvec(sigma * attitude) * Rotation.from_quat(truth.quat[:, [1, 2, 3, 0]])
+    quat = found.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    return replace(fixes, quat=quat, sigma_rot=np.full((n, 3), sigma))
 
 
 def _thinned(session: Session, every_s: float) -> Session:
@@ -173,7 +172,7 @@ def _checked(session: Session, every_s: float) -> Session:
         raise SessionError(
             session.path or "session",
             f"{count} fixes with one in {every_s:g} s",
-            "two at least",
+            "at least two",
             "give --fixes-from-reference, or a shorter --every",
         )
     return session
@@ -189,9 +188,9 @@ def _at_keyframes(config: Config) -> Config:
     return replace(config, run=replace(config.run, rate="keyframes"))
 
 
-def _scored(run: Run, reference: Reference, every_s: float, seed: int, made: bool) -> Iterator[Interval]:
+def _scored(run: Run, reference: Reference, every_s: float, seed: int, generated: bool) -> Iterator[Interval]:
     """The three rows of one replay."""
-    sensor = Sensor.of(run) if made else Sensor()
+    sensor = ReferencePoint.of(run) if generated else ReferencePoint()
     times = _fix_times(run.session)
     between = (reference.t_ns > times[0]) & (reference.t_ns < times[-1]) & ~np.isin(reference.t_ns, times)
     rows = reference.take(between & (reference.t_ns <= run.solution.t_ns[-1]))
@@ -209,19 +208,20 @@ def _scored(run: Run, reference: Reference, every_s: float, seed: int, made: boo
 
 
 def _arrivals(session: Session) -> Times:
-    """When each fix became known."""
+    """When the fixes became available, each time once."""
     return np.unique(np.concatenate([stream.available_ns for stream in session.absolute().values()]))
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """Where and when the reference stands against the body: `offset_s` later than its stamps say, at `lever` (3,) m."""
+class ReferencePoint:
+    """The point of the body whose position the reference gives: at `lever` (3,) m body axes; a stamp t of the reference
+    is IMU time t + `offset_s`."""
 
     offset_s: float = 0.0
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
-    def of(cls, run: Run) -> Sensor:
+    def of(cls, run: Run) -> ReferencePoint:
         """The sensor that gave the pose fixes of a run."""
         states = run.summary["states"]
         offset = float(states.get(f"{FIXES}_time_offset_s", {"value": 0.0})["value"])
@@ -234,8 +234,8 @@ class Sensor:
         return predict_sensor(run.problem, run.solution, t_ns, self.offset_s, np.array(self.lever))
 
     def causal(self, run: Run, t_ns: Times) -> Floats:
-        """Its position (n, 3) as foretold by the keyframe before `t_ns`: nothing later is looked at, so the offset is
-        bridged by the velocity alone."""
+        """Its position (n, 3) predicted from the keyframe before `t_ns`. No later data is used: the time offset is
+        bridged with the velocity."""
         assert run.causal is not None  # of a replay
         there = foretold_at(run.causal_windows, kinematics(run.causal), run.session.gravity, t_ns)
         return placed(there, np.full(len(t_ns), self.offset_s), np.array(self.lever))

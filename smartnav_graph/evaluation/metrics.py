@@ -1,30 +1,34 @@
 """Accuracy of a solution against a reference: absolute and relative errors, percentiles, consistency.
 
-Definitions: Sturm et al. (2012), A Benchmark for the Evaluation of RGB-D SLAM Systems, section IV (APE, RPE).
+APE = |p_est - p_ref| after alignment; rotation = geodesic angle of R_ref^T R_est. RPE over pairs i, j with
+|t_j - t_i - delta| <= half a reference period: with attitude, translation and angle of (Q_i^-1 Q_j)^-1 (P_i^-1 P_j);
+without, the difference of the two displacements. NEES: see `_consistency`; an alignment fitted to the reference makes
+every NEES a little too small.
+
+Source: Sturm et al. (2012), A Benchmark for the Evaluation of RGB-D SLAM Systems, section IV (APE, RPE).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.align import (
-    METHODS,
-    Alignment,
-    Track,
+    FrameAlignment,
+    StateSeries,
     check_overlap,
     find_time_offset,
-    fit,
-    track_of_reference,
-    track_of_solution,
+    fit_alignment,
+    states_of_reference,
+    states_of_solution,
 )
 from smartnav_graph.evaluation.consistency import nees
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
@@ -74,20 +78,32 @@ class Evaluation:
     reference: str
     align: str
     time_offset_s: float
-    matched: int
     unmatched: int
-    ape_m: Statistics
-    rotation_deg: Statistics | None
     rpe: tuple[RelativeError, ...]
     nees: dict[str, float | None]
-    alignment: Alignment
-    t_ns: NDArray[np.int64]
+    alignment: FrameAlignment
+    t_ns: Times
     error_enu_m: Floats
     rotation_error_deg: Floats | None
     sigma_enu: Floats
     notes: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def matched(self) -> int:
+        """Reference rows inside the run."""
+        return len(self.t_ns)
+
+    @cached_property
+    def ape_m(self) -> Statistics:
+        """Absolute position error."""
+        return Statistics.of(np.linalg.norm(self.error_enu_m, axis=1))
+
+    @cached_property
+    def rotation_deg(self) -> Statistics | None:
+        """Absolute attitude error; None without attitude in the reference."""
+        return None if self.rotation_error_deg is None else Statistics.of(self.rotation_error_deg)
+
+    def to_dict(self) -> dict[str, object]:
         """The figures as ``smartnav evaluate --json`` prints them."""
         return {
             "solution": self.solution,
@@ -123,34 +139,23 @@ def evaluate(
     Parameters
     ----------
     align : ``none``, ``yaw`` (vertical rotation and translation), ``se3`` or ``sim3``
-    time_offset_s : a reference stamp t speaks of solution time t + offset; ``auto`` finds it (`find_time_offset`)
-    rpe_deltas_s : seconds between the ends of the motions whose error is told
+    time_offset_s : a reference stamp t is solution time t + offset; ``auto`` finds it (`find_time_offset`)
+    rpe_deltas_s : seconds between the ends of the motions whose error is reported
     solution_name, reference_name : what to call them in the result
 
     Raises
     ------
     SessionError
         No reference stamp lies inside the run; unknown alignment, or one the positions do not determine.
-
-    Notes
-    -----
-    APE = |p_est - p_ref| after alignment; rotation = geodesic angle of R_ref^T R_est. RPE over pairs i, j with
-    |t_j - t_i - delta| <= half a reference period: with attitude, translation and angle of
-    (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) (Sturm et al. 2012); without, the difference of the two displacements.
-    NEES: see `_consistency`. An alignment fitted to the reference makes every NEES a little too small.
     """
-    if align not in METHODS:
-        raise SessionError("--align", f"{align!r}", f"one of {', '.join(METHODS)}")
     offset_s = find_time_offset(solution, reference, align) if time_offset_s == "auto" else float(time_offset_s)
-    estimate, whole = track_of_solution(solution), track_of_reference(reference, round(offset_s * NS))
+    estimate, whole = states_of_solution(solution), states_of_reference(reference, round(offset_s * NS))
     check_overlap(estimate, whole, solution.t0_ns, offset_s)
 
     truth = whole.take(whole.inside(estimate))
     raw = estimate.at(truth.t_ns)
-    alignment = fit(align, raw.position, truth.position)
+    alignment = fit_alignment(align, raw.position, truth.position)
     matched = aligned(raw, alignment)
-    error = matched.position - truth.position
-    angle = rotation_error_deg(matched, truth)
     averages, notes = _consistency(aligned(estimate, alignment), whole)
     assert matched.covariance is not None
     return Evaluation(
@@ -158,36 +163,33 @@ def evaluate(
         reference=reference_name,
         align=align,
         time_offset_s=offset_s,
-        matched=len(truth),
         unmatched=len(whole) - len(truth),
-        ape_m=Statistics.of(np.linalg.norm(error, axis=1)),
-        rotation_deg=None if angle is None else Statistics.of(angle),
         rpe=tuple(relative_error(matched, truth, delta) for delta in rpe_deltas_s),
         nees=averages,
         alignment=alignment,
         t_ns=truth.t_ns,
-        error_enu_m=error,
-        rotation_error_deg=angle,
+        error_enu_m=matched.position - truth.position,
+        rotation_error_deg=rotation_error_deg(matched, truth),
         sigma_enu=np.sqrt(np.clip(np.diagonal(matched.covariance, axis1=1, axis2=2)[:, POS], 0.0, None)),
         notes=notes,
     )
 
 
-def aligned(track: Track, alignment: Alignment) -> Track:
+def aligned(states: StateSeries, alignment: FrameAlignment) -> StateSeries:
     """A solution's states, with covariances, after an alignment."""
-    assert track.rotation is not None and track.velocity is not None and track.covariance is not None
+    assert states.rotation is not None and states.velocity is not None and states.covariance is not None
     scale = np.repeat([1.0, alignment.scale, alignment.scale], 3)
     J = scale[:, None] * np.kron(np.eye(3), alignment.R)
-    return Track(
-        t_ns=track.t_ns,
-        position=alignment.position(track.position),
-        rotation=alignment.rotation(track.rotation),
-        velocity=alignment.vector(track.velocity),
-        covariance=J @ track.covariance @ J.T,
+    return StateSeries(
+        t_ns=states.t_ns,
+        position=alignment.position(states.position),
+        rotation=alignment.rotation(states.rotation),
+        velocity=alignment.vector(states.velocity),
+        covariance=J @ states.covariance @ J.T,
     )
 
 
-def rotation_error_deg(estimate: Track, truth: Track) -> Floats | None:
+def rotation_error_deg(estimate: StateSeries, truth: StateSeries) -> Floats | None:
     """Geodesic angle (n,) between the attitudes; None where one has none."""
     if estimate.rotation is None or truth.rotation is None:
         return None
@@ -199,16 +201,16 @@ def _rotation_error(estimate: Floats, truth: Floats) -> Floats:
     return np.asarray(Rotation.from_matrix(truth @ estimate.transpose(0, 2, 1)).as_rotvec())
 
 
-def relative_error(estimate: Track, truth: Track, delta_s: float) -> RelativeError:
+def relative_error(estimate: StateSeries, truth: StateSeries, delta_s: float) -> RelativeError:
     """Error of the motion over `delta_s`, RMS over all pairs that far apart, half a period more or less."""
     i, j = _pairs(truth.t_ns, delta_s)
     if not len(i):
         return RelativeError(delta_s, None, None, 0)
-    moved, expected = (track.position[j] - track.position[i] for track in (estimate, truth))
+    motion, expected = (one.position[j] - one.position[i] for one in (estimate, truth))
     if estimate.rotation is None or truth.rotation is None:
-        return RelativeError(delta_s, _rms(moved - expected), None, len(i))
+        return RelativeError(delta_s, _rms(motion - expected), None, len(i))
     R, Q = estimate.rotation, truth.rotation
-    difference = np.einsum("nji,nj->ni", R[i], moved) - np.einsum("nji,nj->ni", Q[i], expected)
+    difference = np.einsum("nji,nj->ni", R[i], motion) - np.einsum("nji,nj->ni", Q[i], expected)
     turn = _rotation_error(R[i].transpose(0, 2, 1) @ R[j], Q[i].transpose(0, 2, 1) @ Q[j])
     return RelativeError(delta_s, _rms(difference), float(np.degrees(_rms(turn))), len(i))
 
@@ -217,7 +219,7 @@ def _rms(vectors: Floats) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
-def _pairs(t_ns: NDArray[np.int64], delta_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(t_ns: Times, delta_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices i < j of all pairs `delta_s` +- half a median period apart."""
     if len(t_ns) < 2:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
@@ -231,12 +233,12 @@ def _pairs(t_ns: NDArray[np.int64], delta_s: float) -> tuple[NDArray[np.intp], N
     return i, j
 
 
-def _consistency(estimate: Track, truth: Track) -> tuple[dict[str, float | None], tuple[str, ...]]:
+def _consistency(estimate: StateSeries, truth: StateSeries) -> tuple[dict[str, float | None], tuple[str, ...]]:
     """Average NEES of position, velocity, attitude, yaw.
 
     Compared at the epochs of whichever is sparser, the denser one interpolated: a linear interpolation over 1 s
-    between keyframes errs by more than a good solution's sigma. Rows inside a hole of the reference are left out.
-    Where the reference tells its own sigmas they join the covariance of the position.
+    between keyframes errs by more than a good solution's sigma. Rows inside a gap of the reference are left out.
+    Sigmas of the reference, where given, are added to the covariance of the position.
     """
     estimate, truth = _at_common_epochs(estimate, truth)
     if not len(truth):
@@ -269,7 +271,7 @@ def _consistency(estimate: Track, truth: Track) -> tuple[dict[str, float | None]
     return averages, tuple(notes)
 
 
-def _at_common_epochs(estimate: Track, truth: Track) -> tuple[Track, Track]:
+def _at_common_epochs(estimate: StateSeries, truth: StateSeries) -> tuple[StateSeries, StateSeries]:
     inside, covered = truth.take(truth.inside(estimate)), estimate.take(estimate.inside(truth))
     if len(inside) <= len(covered):
         return estimate.at(inside.t_ns), inside

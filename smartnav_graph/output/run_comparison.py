@@ -79,7 +79,7 @@ class RunDifferences:
         yield MEANING
 
     def _row(self, measure: Measure) -> tuple[str, ...]:
-        one = self.states.apart(measure)
+        one = self.states.statistics(measure)
         s = one.statistics
         figures = [f"{value:.4g}" for value in (s.rmse, s.p50, s.p95, s.max)]
         name = f"{measure.name.split('_')[0]}{' bias' if 'bias' in measure.name else ''} {measure.unit}"

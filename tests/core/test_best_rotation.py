@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import best_rotation
-from smartnav_graph.evaluation.align import fit
+from smartnav_graph.evaluation.align import fit_alignment
 
 # Two unrelated sets of points. The expected values were computed once with evo 1.38.1 (umeyama_alignment, with and
 # without scale): for the two sets, and for the first set and its mirror image in the xy plane.
@@ -64,7 +64,7 @@ MIRRORED = [
 )
 def test_equals_evo(y, R, shift, scaled_shift, scale):
     for method, expected_shift, expected_scale in (("se3", shift, 1.0), ("sim3", scaled_shift, scale)):
-        found = fit(method, X, y)
+        found = fit_alignment(method, X, y)
         assert pytest.approx(np.array(R), abs=1e-12) == found.R
         assert found.t == pytest.approx(expected_shift, abs=1e-12)
         assert found.scale == pytest.approx(expected_scale, abs=1e-12)
@@ -73,7 +73,7 @@ def test_equals_evo(y, R, shift, scaled_shift, scale):
 @pytest.mark.parametrize("scale", [1.0, 0.01, 40.0])
 def test_a_similarity_is_recovered(scale):
     R, t = Rotation.from_euler("ZYX", [170.0, -85.0, 100.0], degrees=True).as_matrix(), np.array([3.0, -7.0, 1.0])
-    found = fit("sim3", X, scale * X @ R.T + t)
+    found = fit_alignment("sim3", X, scale * X @ R.T + t)
     assert pytest.approx(R, abs=1e-12) == found.R
     assert found.scale == pytest.approx(scale, rel=1e-12)
     assert found.t == pytest.approx(t, abs=1e-12 * max(scale, 1.0))
@@ -99,4 +99,4 @@ def test_points_on_a_line_leave_the_rotation_open(where):
     for method in ("se3", "sim3"):
         for truth in (line, line @ R.T, np.random.default_rng(1).normal(size=line.shape)):
             with pytest.raises(SessionError, match="do not determine the rotation"):
-                fit(method, line, truth)
+                fit_alignment(method, line, truth)

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_seconds, ns_from_texts
 from smartnav_graph.evaluation import evaluate
-from smartnav_graph.evaluation.align import fit, track_of_solution
+from smartnav_graph.evaluation.align import fit_alignment, states_of_solution
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.session.streams import Reference
 
 
 def moved(solution, R, t, scale=1.0):
-    """The solution as told in another frame, so that p_ref = scale R p_est + t."""
+    """The solution in another frame, so that p_ref = scale R p_est + t."""
     return dataclasses.replace(
         solution,
         nav_t_body=(solution.nav_t_body - t) @ R / scale,
@@ -65,7 +65,7 @@ def test_interpolation_is_linear_and_slerp():
     R0 = solution.nav_R_body[0]
     R1 = R0 @ Rotation.from_rotvec([0.0, 0.0, np.radians(100.0)]).as_matrix()
     solution = dataclasses.replace(solution, nav_R_body=np.stack([R0, R1]))
-    between = track_of_solution(solution).at(np.array([T0 + NS // 4]))
+    between = states_of_solution(solution).at(np.array([T0 + NS // 4]))
     assert between.position[0] == pytest.approx(0.75 * solution.nav_t_body[0] + 0.25 * solution.nav_t_body[1])
     turned = Rotation.from_matrix(R0.T @ between.rotation[0]).as_rotvec(degrees=True)
     assert turned == pytest.approx([0.0, 0.0, 25.0])
@@ -111,7 +111,7 @@ def test_unknown_method_is_refused(seconds):
 def test_fit_agrees_with_a_numerical_minimum():
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
-    found = fit("yaw", a, b)
+    found = fit_alignment("yaw", a, b)
 
     def cost(psi):
         R = Rotation.from_euler("z", psi).as_matrix()

@@ -38,19 +38,19 @@ def second(first):
 def test_what_was_planted_is_told(first, second):
     found = compare(first, second)
     assert len(found) == len(first)
-    assert found.apart(BY_NAME["horizontal_m"]).statistics.p50 == pytest.approx(5.0)
-    assert found.apart(BY_NAME["height_m"]).statistics.max == pytest.approx(20.0)
-    assert found.apart(BY_NAME["heading_deg"]).statistics.rmse == pytest.approx(np.degrees(0.1))
-    assert found.apart(BY_NAME["rotation_deg"]).statistics.max == pytest.approx(np.degrees(0.1))
-    assert found.apart(BY_NAME["velocity_m_s"]).statistics.mean == pytest.approx(0.5)
-    assert found.apart(BY_NAME["gyro_bias_deg_s"]).statistics.max == pytest.approx(0.5)
-    assert found.apart(BY_NAME["accel_bias_m_s2"]).statistics.max == 0.0
+    assert found.statistics(BY_NAME["horizontal_m"]).statistics.p50 == pytest.approx(5.0)
+    assert found.statistics(BY_NAME["height_m"]).statistics.max == pytest.approx(20.0)
+    assert found.statistics(BY_NAME["heading_deg"]).statistics.rmse == pytest.approx(np.degrees(0.1))
+    assert found.statistics(BY_NAME["rotation_deg"]).statistics.max == pytest.approx(np.degrees(0.1))
+    assert found.statistics(BY_NAME["velocity_m_s"]).statistics.mean == pytest.approx(0.5)
+    assert found.statistics(BY_NAME["gyro_bias_deg_s"]).statistics.max == pytest.approx(0.5)
+    assert found.statistics(BY_NAME["accel_bias_m_s2"]).statistics.max == 0.0
     np.testing.assert_allclose(found.difference[0, 3:6], [3.0, 4.0, 2.0])  # second less first
     np.testing.assert_allclose(found.difference[0, :3], [0.0, 0.0, 0.1], atol=1e-12)
 
 
 def test_where_it_is_largest_and_how_much_of_a_sigma(first, second):
-    one = compare(first, second).apart(BY_NAME["position_m"])
+    one = compare(first, second).statistics(BY_NAME["position_m"])
     assert one.largest_at_s == 10.0
     # of the two the second is the less sure: 0.2 m on each axis
     assert one.largest_sigmas == pytest.approx(10 * np.sqrt(29) / (0.2 * np.sqrt(3)))
@@ -68,7 +68,7 @@ def test_other_epochs_are_compared_by_interpolation(first):
     """A run at other epochs: linear in between, so a smooth path differs by its curvature only."""
     found = compare(first, make_solution(SECONDS[:-1] + 0.25))
     assert len(found) == len(first) - 2
-    assert found.apart(BY_NAME["position_m"]).statistics.max < 0.05
+    assert found.statistics(BY_NAME["position_m"]).statistics.max < 0.05
 
 
 def test_runs_without_a_common_time_are_refused(first):
@@ -86,7 +86,7 @@ def test_rejected_rows_that_only_one_run_has():
     assert rejected_sets({}, {}) == {}
 
 
-def test_only_figures_that_differ_are_told():
+def test_only_figures_that_differ_are_reported():
     one = {
         "mode": "batch",
         "path_m": 3.0,

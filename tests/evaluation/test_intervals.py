@@ -1,4 +1,4 @@
-"""Errors between fixes: what counts, what is foretold, what is made of a reference."""
+"""Errors between fixes: what counts, what is predicted, what is generated from a reference."""
 
 import json
 
@@ -32,11 +32,11 @@ def walk():
 
 @pytest.fixture(scope="module")
 def found(walk):
-    rows = list(intervals(walk, walk.reference, (1.0, 3.0), made=GOOD))
+    rows = list(intervals(walk, walk.reference, (1.0, 3.0), generated=GOOD))
     return {(row.every_s, row.kind): row for row in rows}
 
 
-def test_fixes_are_made_of_the_reference(walk):
+def test_fixes_are_generated_from_the_reference(walk):
     made = with_fixes(walk, walk.reference, 2.0, FixesFromReference(0.5, 3.0, 1.0), seed=4)
     assert made.gnss is None and made.control is None
     fixes = made.pose_fixes
@@ -77,14 +77,14 @@ def test_smoothed_beats_causal_beats_the_end_and_longer_is_worse(found):
     assert found[1.0, "smoothed"].mean_m < 0.02  # m, fixes of 0.01 m
 
 
-def test_the_end_is_foretold_not_known(walk):
+def test_the_end_is_predicted_not_known(walk):
     # were the fix at the interval's end known, the error were that of the fix itself, 0.016 m in space
-    rows = list(intervals(walk, walk.reference, (3.0,), made=FixesFromReference(0.01)))
+    rows = list(intervals(walk, walk.reference, (3.0,), generated=FixesFromReference(0.01)))
     assert rows[2].kind == "causal_end" and rows[2].mean_m > 0.05
 
 
 def test_latency_lengthens_the_causal_error_and_spares_the_smoothed(walk, found):
-    late = list(intervals(walk, walk.reference, (3.0,), made=FixesFromReference(0.01, 0.5, 1.0)))
+    late = list(intervals(walk, walk.reference, (3.0,), generated=FixesFromReference(0.01, 0.5, 1.0)))
     assert late[0].mean_m == pytest.approx(found[3.0, "smoothed"].mean_m, rel=0.05)
     assert late[2].mean_m > found[3.0, "causal_end"].mean_m
 
@@ -96,7 +96,7 @@ def test_own_fixes_are_thinned(walk):
 
 
 def test_what_is_refused(walk):
-    with pytest.raises(SessionError, match=r"1 fixes with one in 100 s; expected two at least"):
+    with pytest.raises(SessionError, match=r"1 fixes with one in 100 s; expected at least two"):
         next(iter(intervals(walk, walk.reference, (100.0,))))
     with pytest.raises(ConfigError, match="--every: 0; expected spacings > 0 s"):
         next(iter(intervals(walk, walk.reference, (0,))))

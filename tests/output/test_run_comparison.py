@@ -28,7 +28,7 @@ def test_text_says_where_how_far_and_what_was_asked(runs):
     assert "config   run.withhold: [] | [gnss:every=2]" in text
     assert "figures  withheld.gnss: - | " in text
     (line,) = [line for line in text.splitlines() if line.startswith("horizontal m")]
-    largest = found.states.apart(MEASURES[1])
+    largest = found.states.statistics(MEASURES[1])
     assert MEANING in text.splitlines()
     assert line.split()[5:7] == [f"{largest.statistics.max:.4g}", f"{largest.largest_at_s:.2f}"]
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph import readers
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import interpolate
-from smartnav_graph.evaluation.align import fit
+from smartnav_graph.evaluation.align import fit_alignment
 from smartnav_graph.readers.reference import load_reference, load_transform
 from smartnav_graph.session.folder import save
 from smartnav_graph.session.session import Session
@@ -171,7 +171,7 @@ def test_kitti_body_positions_are_those_of_the_wheel(dataset):
 
     def misfit(positions):
         at = interpolate(t_ns[inside], reference.t_ns, positions)
-        found = fit("sim3", at, fixes.enu[inside])
+        found = fit_alignment("sim3", at, fixes.enu[inside])
         assert found.scale == pytest.approx(0.998, abs=2e-3)
         residual = fixes.enu[inside] - found.position(at)
         return np.sqrt((residual**2).sum(axis=1).mean())

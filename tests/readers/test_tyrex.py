@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import interpolate
-from smartnav_graph.evaluation.align import fit
+from smartnav_graph.evaluation.align import fit_alignment
 
 TURN = Rotation.from_euler("z", 90, degrees=True)  # body x points north
 
@@ -164,7 +164,7 @@ def test_public_recordings(dataset, name):
     known = np.isfinite(reference.extra["system_qw"])
     own = Rotation.from_quat(np.stack([reference.extra[f"system_q{a}"][known] for a in "xyzw"], axis=-1))
     heads = [attitude.apply([0.0, 1.0, 0.0]) for attitude in (own, R[known])]
-    back = fit("yaw", *heads).R
+    back = fit_alignment("yaw", *heads).R
     error = np.degrees((R[known].inv() * Rotation.from_matrix(back) * own).magnitude())
     assert error.mean() == pytest.approx(expected["own_deg"], abs=0.3)
 

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.factors import BUILDERS
 from smartnav_graph.graph.states import STATES, letters_of
 from smartnav_graph.graph.update import FactorId
@@ -27,17 +27,17 @@ from smartnav_graph.smoothers.whole_graph import StackedFactors
 Names = NDArray[np.uint64]
 
 FACTORS, KEYFRAMES = "influence.parquet", "keyframes.parquet"
-# Source of what was known of the session's states (clock offsets, lever arms, mounts) before.
+# Source of the priors of the session's states (clock offsets, lever arms, mounts).
 CALIBRATION = "calibration"
-# Tags that do not begin with the name of their builder.
+# Sensors of factors that do not begin with the name of their builder.
 _OF_OTHERS = {"rest": "prior", "pace": "gravity"}
 
 
 class Group(NamedTuple):
-    """Factors alike: stamps (g,), row of their stream (g,) or -1, keys (g, k), whitened [J b] (g, m, width + 1)."""
+    """Factors of one shape: t_ns (g,), row (g,) of their stream or -1, keys (g, k), whitened [J b] (g, m, width + 1)."""
 
     sensor: str
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     row: NDArray[np.int64]
     keys: Names
     augmented: Floats
@@ -48,15 +48,15 @@ class Keyframes:
     """index (n,) in the keys, t_ns (n,), kind (n,) of the window before (see `graph.Window`), nav_R_body (n, 3, 3)."""
 
     index: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
-    kind: NDArray[Any]
+    t_ns: Times
+    kind: NDArray[np.object_]
     nav_R_body: Floats
 
     def __len__(self) -> int:
         return len(self.index)
 
     def nearest(self, t_ns: int) -> int:
-        """Place of the keyframe nearest in time."""
+        """Row of the keyframe nearest in time."""
         return int(np.abs(self.t_ns - t_ns).argmin())
 
 
@@ -69,7 +69,7 @@ class Influence:
 
     @classmethod
     def of(cls, estimate: Estimate, windows: Iterable[Window]) -> Influence:
-        """Of an estimate and the windows that lead to its keyframes."""
+        """Of an estimate and the windows before its keyframes."""
         kinds = {window.index: window.kind for window in windows}
         index = np.array(estimate.indices, dtype=np.int64)
         kind = np.array([kinds[i] for i in estimate.indices], dtype=object)
@@ -119,7 +119,7 @@ class Influence:
 
 
 def builder_of(tag: str) -> str:
-    """The builder behind a factor's tag: ``imu_bias`` comes from ``imu``."""
+    """The builder of a factor, from the sensor of its id: ``imu_bias`` comes from ``imu``."""
     return tag if tag in BUILDERS else _OF_OTHERS.get(tag, tag.split("_")[0])
 
 
@@ -129,17 +129,17 @@ def _native(estimate: Estimate) -> Iterator[Group]:
     for _, factor in estimate.factors:
         graph.push_back(factor)
     linear = graph.linearize(estimate.values)
-    found: dict[tuple[Any, ...], list[tuple[FactorId, list[int], Floats]]] = {}
+    found: dict[tuple[object, ...], list[tuple[FactorId, list[int], Floats]]] = {}
     for i, (tag, _) in enumerate(estimate.factors):
         factor = linear.at(i)
-        if factor is None:  # a factor that says nothing at these values
+        if factor is None:  # no information at these values
             continue
         keys, augmented = factor.keys(), factor.augmentedJacobian()
         shape = (tag.sensor, letters_of(np.array(keys, dtype=np.uint64)).tobytes(), augmented.shape)
         found.setdefault(shape, []).append((tag, keys, augmented))
-    for (sensor, *_), items in found.items():
+    for items in found.values():
         tags = [tag for tag, _, _ in items]
-        yield _group(sensor, tags, [keys for _, keys, _ in items], np.array([rows for _, _, rows in items]))
+        yield _group(tags[0].sensor, tags, [keys for _, keys, _ in items], np.array([rows for _, _, rows in items]))
 
 
 def _group(sensor: str, tags: Sequence[FactorId], keys: Sequence[Sequence[int]], augmented: Floats) -> Group:
@@ -148,8 +148,8 @@ def _group(sensor: str, tags: Sequence[FactorId], keys: Sequence[Sequence[int]],
     return Group(sensor, t_ns, row, np.array(keys, dtype=np.uint64), augmented)
 
 
-def _of_stack(stack: StackedFactors, values: Any) -> Group:
-    """The used rows of a stack under their loss, without the states that are held."""
+def _of_stack(stack: StackedFactors, values: gtsam.Values) -> Group:
+    """The used rows of a stack under their loss, without fixed states."""
     residual, jacobians = stack.linearize(values)
     free = [i for i, name in enumerate(stack.keys[0]) if name not in stack.held]
     rows = np.concatenate([*(jacobians[i] for i in free), -residual[:, :, None]], axis=2)
@@ -160,7 +160,7 @@ def _of_stack(stack: StackedFactors, values: Any) -> Group:
 
 
 def _priors(estimate: Estimate) -> Iterator[Group]:
-    """Priors of the session states that are not held."""
+    """Priors of the session states that are estimated."""
     for state in estimate.session.values():
         if not state.held:
             rows = np.column_stack([np.eye(len(state.value)), state.prior_mean - state.value])
@@ -168,7 +168,7 @@ def _priors(estimate: Estimate) -> Iterator[Group]:
             yield _group(CALIBRATION, [tag], [[state.key]], (rows / state.prior_sigma[:, None])[None])
 
 
-def _lists(arrays: Sequence[NDArray[Any]]) -> pa.ListArray:
+def _lists(arrays: Sequence[Names] | Sequence[Floats]) -> pa.ListArray:
     """One list a row of arrays (g, ...)."""
     sizes = np.concatenate([np.full(len(array), array[0].size) for array in arrays])
     offsets = np.concatenate([[0], np.cumsum(sizes)])
@@ -181,7 +181,7 @@ def _grouped(table: pa.Table) -> Iterator[Group]:
     sensor = table.column("sensor").to_numpy()
     t_ns, row = (table.column(name).to_numpy() for name in ("t_ns", "row"))
     keys, values = (_rows_of(table.column(name)) for name in ("keys", "values"))
-    found: dict[tuple[Any, ...], list[int]] = {}
+    found: dict[tuple[str, bytes, int], list[int]] = {}
     for i, (names, numbers) in enumerate(zip(keys, values, strict=True)):
         found.setdefault((sensor[i], letters_of(names).tobytes(), len(numbers)), []).append(i)
     for (name, kinds, _), rows in found.items():

@@ -1,35 +1,34 @@
-"""What holds one keyframe: shares, pulls, and what would be left without a source."""
+"""Influence of all measurements on one keyframe: shares of its variance, pulls, and its sigma without a source."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
-from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.evaluation.influence.factors import Influence, builder_of
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, indices_of, letters_of
 
-# A sigma that grows by more than this factor without a source: the component is lost without it.
+# Without a source a component is not observable if its sigma grows by more than this factor.
 LOST = 100.0
-# Share of the diagonal that carries the elimination past what nothing holds.
+# Added to the scaled diagonal so that the factorisation of a system without one source does not stop.
 RIDGE = 1e-13
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Every factor of the graph by itself: source (f,), t_ns (f,), row (f,), and of the keyframe at hand share (f, 15)
-    of its variance and pull (f, 15) in sigmas."""
+    """Every factor of the graph: source (f,), t_ns (f,), row (f,), share (f, 15) of the variance of the keyframe and
+    pull (f, 15) in sigmas."""
 
-    source: NDArray[Any]
-    t_ns: NDArray[np.int64]
+    source: NDArray[np.object_]
+    t_ns: Times
     row: NDArray[np.int64]
     share: Floats
     pull: Floats
@@ -37,15 +36,15 @@ class Measurements:
 
 @dataclass(frozen=True)
 class KeyframeInfluence:
-    """What holds one keyframe. Fifteen components: rotation, position, velocity (nav axes), biases (body axes).
+    """Influence on one keyframe. Fifteen components: rotation, position, velocity (nav axes), biases (body axes).
 
-    place : among the keyframes; covariance (15, 15) given all data
+    place : row among the keyframes; covariance (15, 15) given all data
     sources : names of the s builders of the whole graph, and `CALIBRATION`
-    share (s, 15) : of each component's variance, by source; here (s, 15) : the part of it from factors that touch this
+    share (s, 15) : of each component's variance, by source; here (s, 15) : its part from factors that touch this
     keyframe and no other
-    pull (s, 15) : how far each source draws the state against the others, in sigmas; touching (s,) : factors that touch
-    the keyframe; pull_here (s, 15) : the part of the pull that is theirs; own (s, 15) : sigma that they alone would
-    leave to a component if all else were known, inf where they tell nothing of it
+    pull (s, 15) : how far each source shifts the state against the others, in sigmas; touching (s,) : number of factors
+    that touch the keyframe; pull_here (s, 15) : their part of the pull; own (s, 15) : sigma of a component from these
+    factors alone if all else were known, inf without information
     without (s, 15) : sigma without the source over sigma, inf beyond `LOST`
     """
 
@@ -67,15 +66,15 @@ class KeyframeInfluence:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def held(influence: Influence, place: int) -> KeyframeInfluence:
-    """What holds keyframe `place`.
+def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence:
+    """Shares, pulls and sigmas without a source of the keyframe in row `place`.
 
     Raises
     ------
     SolverError
         The system does not determine that keyframe.
     """
-    system = System(influence)
+    system = _LinearSystem(influence)
     index = int(influence.keyframes.index[place])
     columns, turn = system.columns(index), _to_nav(influence.keyframes.nav_R_body[place])
     covariances = _determined(system, columns, index)
@@ -109,7 +108,7 @@ def held(influence: Influence, place: int) -> KeyframeInfluence:
     )
 
 
-def _determined(system: System, columns: NDArray[np.int64], index: int) -> Floats:
+def _determined(system: _LinearSystem, columns: NDArray[np.int64], index: int) -> Floats:
     """Columns (n, 15) of the covariance, checked."""
     try:
         found = system.covariances(columns)
@@ -122,7 +121,7 @@ def _determined(system: System, columns: NDArray[np.int64], index: int) -> Float
     return found
 
 
-class System:
+class _LinearSystem:
     """The sparse rows J dx = b; `factor` (m,) is the factor of each row, `source` (f,) the source of each factor."""
 
     def __init__(self, influence: Influence) -> None:
@@ -156,7 +155,7 @@ class System:
         return _summing(self.factor)
 
     def _columns_of(self, names: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Columns (g, width) of the states of alike factors, keys (g, k)."""
+        """Columns (g, width) of the states of factors of one shape, keys (g, k)."""
         sizes = [STATES[chr(letter)].dim for letter in letters_of(names[0])]
         first = np.array([self._first[name] for name in names.ravel().tolist()]).reshape(names.shape)
         return np.concatenate([first[:, [i]] + np.arange(size) for i, size in enumerate(sizes)], axis=1)
@@ -183,14 +182,14 @@ class System:
         return _covariances(self.J, columns, 0.0)
 
     def sigma_without(self, source: int, columns: NDArray[np.int64], turn: Floats) -> Floats:
-        """Sigma (15,) in nav axes without one source, inf where nothing determines it then."""
-        kept = self.J[self.source[self.factor] != source]
-        variance = np.diag(turn @ _covariances(kept, columns, RIDGE)[columns] @ turn.T)
+        """Sigma (15,) in nav axes without one source, inf where it is then not determined."""
+        others = self.J[self.source[self.factor] != source]
+        variance = np.diag(turn @ _covariances(others, columns, RIDGE)[columns] @ turn.T)
         return np.asarray(np.sqrt(np.where(np.isfinite(variance) & (variance > 0), variance, np.inf)))
 
 
 def _first_columns(names: NDArray[np.uint64]) -> dict[int, int]:
-    """First column of each state, keyframes in time order and then what they share; the number of columns at -1."""
+    """First column of each state, keyframes in time order, then the session states; the number of columns at -1."""
     kind, index = letters_of(names), indices_of(names)
     shared = np.array([STATES[chr(letter)].scope == "session" for letter in kind])
     order = np.lexsort((kind, index, shared))
@@ -212,7 +211,7 @@ def _to_nav(nav_R_body: Floats) -> Floats:
 def _covariances(J: csr_matrix, columns: NDArray[np.int64], ridge: float) -> Floats:
     """Columns of (J^T J)^-1 by Cholesky's LU of the normal equations with a diagonal of one, refined once.
 
-    States in time order make the chain its own best elimination order.
+    The time order of the states is a good elimination order of the chain.
     """
     square = np.asarray(J.multiply(J).sum(axis=0)).ravel()
     scale = 1.0 / np.sqrt(np.where(square > 0, square, 1.0))

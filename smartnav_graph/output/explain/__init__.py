@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import ns_from_seconds
-from smartnav_graph.evaluation.influence import FACTORS, KEYFRAMES, Influence, held
+from smartnav_graph.evaluation.influence import FACTORS, KEYFRAMES, Influence, influence_of_keyframe
 from smartnav_graph.graph.solution import POS
 from smartnav_graph.output.explain.figures import Explanation
 from smartnav_graph.output.explain.nearby import Nearby, nearby
@@ -57,7 +57,7 @@ def explain(run: StoredRun, at_s: float | None = None) -> Explained:
     influence = _read(run)
     asked = None if at_s is None else _checked(run, at_s)
     place = influence.keyframes.nearest(_least_certain(run) if asked is None else asked)
-    figures = Explanation(run, influence, held(influence, place), asked)
+    figures = Explanation(run, influence, influence_of_keyframe(influence, place), asked)
     near = nearby(run, figures.held.measurements, figures.seconds(figures.t_ns))
     return Explained(figures, near, tuple(sentences(figures, near)))
 

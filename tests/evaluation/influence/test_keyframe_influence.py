@@ -1,10 +1,10 @@
-"""What holds a state, against systems that can be solved by hand."""
+"""Influence on a keyframe, against systems that can be solved by hand."""
 
 import numpy as np
 import pytest
 
 from smartnav_graph.core.errors import SolverError
-from smartnav_graph.evaluation.influence import CALIBRATION, Group, Influence, Keyframes, held
+from smartnav_graph.evaluation.influence import CALIBRATION, Group, Influence, Keyframes, influence_of_keyframe
 from smartnav_graph.graph.states import key
 
 EAST = 3  # of the fifteen components
@@ -25,7 +25,7 @@ def group(sensor: str, index: tuple[int, ...], letters: str, *jacobians: np.ndar
 
 
 def prior(index: int, *, place: bool) -> list[Group]:
-    """Unit knowledge of everything at one keyframe, of its place only where asked."""
+    """Unit information of every component of one keyframe, of its position only on request."""
     of_pose = np.eye(6) if place else np.eye(6)[:3]
     return [
         group("prior", (index,), "X", of_pose, b=np.zeros(len(of_pose))),
@@ -44,8 +44,8 @@ def link(one: int, other: int, sigma: float, b: float = 0.0) -> Group:
     return group("imu", (one, other), "XX", -rows, rows, b=np.array([b, 0.0, 0.0]))
 
 
-def test_a_place_known_by_fixes_alone_is_all_theirs_and_a_heading_before_any_motion_all_the_priors():
-    found = held(Influence([*prior(0, place=False), fix(0, sigma=2.0)], keyframes(1)), 0)
+def test_fixes_alone_give_the_position_and_the_prior_alone_the_heading():
+    found = influence_of_keyframe(Influence([*prior(0, place=False), fix(0, sigma=2.0)], keyframes(1)), 0)
     assert found.sources == ("gnss", "prior")
     np.testing.assert_allclose(found.share[0], [0, 0, 0, 1, 1, 1, *[0] * 9])
     np.testing.assert_allclose(found.share[1], [1, 1, 1, 0, 0, 0, *[1] * 9])
@@ -55,7 +55,7 @@ def test_a_place_known_by_fixes_alone_is_all_theirs_and_a_heading_before_any_mot
     assert found.touching.tolist() == [1, 3]
 
 
-# Fixes at 0 and 3 of sigma 1, tied by a link of variance 2 that says no distance: x0 = 3/4, x1 = 9/4, variance 3/4.
+# Fixes at 0 and 3 of sigma 1, tied by a link of variance 2 and measured distance 0: x0 = 3/4, x1 = 9/4, variance 3/4.
 CHAIN = [
     *prior(0, place=False),
     *prior(1, place=False),
@@ -66,7 +66,7 @@ CHAIN = [
 
 
 def test_shares_pulls_and_absences_along_a_chain():
-    found = held(Influence(CHAIN, keyframes(2)), 0)
+    found = influence_of_keyframe(Influence(CHAIN, keyframes(2)), 0)
     gnss, imu, _ = range(3)
     np.testing.assert_allclose(found.covariance[EAST, EAST], 0.75)
     # K of the near fix is P = 3/4, of the link P sqrt(2) / 3, of the far fix P / 3
@@ -80,36 +80,36 @@ def test_shares_pulls_and_absences_along_a_chain():
     assert np.isinf(found.own[gnss, 0])
 
 
-def test_every_measurement_by_itself():
-    told = held(Influence(CHAIN, keyframes(2)), 0).measurements
-    far = np.flatnonzero((told.source == "gnss") & (told.t_ns == 10**9))
-    np.testing.assert_allclose(told.share[far, EAST], 0.75 / 9)
-    np.testing.assert_allclose(told.pull[far, EAST], 0.25 * 0.75 / np.sqrt(0.75))
-    assert told.row[far] == [7]
-    np.testing.assert_allclose(told.share.sum(axis=0), 1.0)
-    np.testing.assert_allclose(told.pull.sum(axis=0), 0.0, atol=1e-12)  # the solution is where pulls balance
+def test_every_measurement():
+    each = influence_of_keyframe(Influence(CHAIN, keyframes(2)), 0).measurements
+    far = np.flatnonzero((each.source == "gnss") & (each.t_ns == 10**9))
+    np.testing.assert_allclose(each.share[far, EAST], 0.75 / 9)
+    np.testing.assert_allclose(each.pull[far, EAST], 0.25 * 0.75 / np.sqrt(0.75))
+    assert each.row[far] == [7]
+    np.testing.assert_allclose(each.share.sum(axis=0), 1.0)
+    np.testing.assert_allclose(each.pull.sum(axis=0), 0.0, atol=1e-12)  # the solution is where pulls balance
 
 
-def test_components_are_told_in_nav_axes():
+def test_components_are_in_nav_axes():
     """A body that heads west: a tie along its x axis is one to the north."""
     rows = np.eye(6)[3:] / np.array([[1.0], [2.0], [4.0]])
     places = group("gnss", (0,), "X", rows, b=np.array([0.5, 0.0, 0.0]))
-    found = held(Influence([*prior(0, place=False), places], keyframes(1, TURN)), 0)
+    found = influence_of_keyframe(Influence([*prior(0, place=False), places], keyframes(1, TURN)), 0)
     np.testing.assert_allclose(found.sigma[3:6], [2.0, 1.0, 4.0])
     np.testing.assert_allclose(found.pull[0, 3:6], [0.0, 0.5, 0.0], atol=1e-12)
 
 
-def test_what_the_session_shares_is_no_neighbour():
-    """A fix that also speaks of a clock offset still stands at this keyframe alone."""
+def test_a_session_state_is_not_another_keyframe():
+    """A fix that also depends on a clock offset touches this keyframe alone."""
     timed = group("gnss", (0, 1), "XT", np.eye(6)[3:], np.array([[10.0], [0.0], [0.0]]), b=np.zeros(3))
     clock = group(CALIBRATION, (1,), "T", np.array([[20.0]]), b=np.zeros(1))
-    found = held(Influence([*prior(0, place=False), timed, clock], keyframes(1)), 0)
+    found = influence_of_keyframe(Influence([*prior(0, place=False), timed, clock], keyframes(1)), 0)
     gnss, calibration = found.sources.index("gnss"), found.sources.index(CALIBRATION)
     # variance of the place: 1 of the fix, (10 / 20)^2 of the clock
     np.testing.assert_allclose(found.share[[gnss, calibration], EAST], [0.8, 0.2])
     np.testing.assert_allclose(found.here[gnss, EAST], 0.8)
 
 
-def test_a_keyframe_that_nothing_holds_is_refused():
+def test_a_keyframe_that_is_not_determined_is_refused():
     with pytest.raises(SolverError, match="keyframe 0: is not determined by the factors stored with the run"):
-        held(Influence([*prior(0, place=False), *prior(1, place=True)], keyframes(2)), 0)
+        influence_of_keyframe(Influence([*prior(0, place=False), *prior(1, place=True)], keyframes(2)), 0)
