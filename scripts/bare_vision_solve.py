@@ -18,7 +18,7 @@ import gtsam
 
 import smartnav_graph as sn
 from smartnav_graph.core.progress import silent
-from smartnav_graph.estimate.passes import _window_by_window, solve_passes
+from smartnav_graph.estimate.passes import causal_start, solve_passes
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.run import initialise
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, key
@@ -40,8 +40,7 @@ def solve(folder: str) -> dict[str, float]:
     config = sn.Config()
     problem = prepare(sn.load(folder), config)
     initial = initialise(problem)
-    builders = [initial.prior, *problem.builders]
-    start, pass_state = _window_by_window(problem, problem.windows, builders, initial.pass_state, silent)
+    start, pass_state = causal_start(problem, problem.windows, initial.prior, initial.pass_state, silent)
     found, _, _ = solve_passes(problem, problem.windows, initial.prior, pass_state, initial_values=start)
     graph, held = gtsam.NonlinearFactorGraph(), {}
     for _, factor in found.factors:
@@ -53,7 +52,7 @@ def solve(folder: str) -> dict[str, float]:
             pairs += 1
     values = gtsam.Values(start)
     for builder in problem.builders:
-        for state in builder.eye.states().values() if builder.name == "coplanarity" else ():
+        for state in builder.camera_model.states().values() if builder.name == "coplanarity" else ():
             graph.push_back(session_prior(state))
             values.insert(state.key, state.initial)
     ours = vectorised(found, values)

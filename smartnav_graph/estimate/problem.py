@@ -157,7 +157,7 @@ def make_builders(context: FactorContext) -> list[Builder]:
     return [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
 
 
-def recut(problem: Problem, available_ns: int | None = None) -> Problem:
+def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
     """The same stretch as batch sees it: every row at the time it speaks of, gaps bridged by all that was recorded.
     Only rows known by `available_ns` where that is given; the problem itself where there is no difference."""
     session, config, gaps = problem.session, problem.config, problem.gaps

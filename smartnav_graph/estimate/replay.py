@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.passes import Clock, _no_collection, solve_passes
-from smartnav_graph.estimate.problem import TOO_LATE, Problem, prepare, recut
+from smartnav_graph.estimate.passes import Clock, run_pass, solve_passes
+from smartnav_graph.estimate.problem import TOO_LATE, Problem, batch_problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     carried_over,
     causal_solution,
@@ -23,18 +22,16 @@ from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.run import Run, _finish, initialise
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
-from smartnav_graph.graph.states import State
-from smartnav_graph.graph.update import build_update
 from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
 
-# A polish that moves a state further than this starts anew from what it found.
+# A polish that moves a state further than this starts again from what it found.
 FAR_M, FAR_DEG = 0.1, 1.0
 
 
 def replay(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
-    """One window at a time, causal but for the initialisation stretch (at most 30 s); an interrupt leaves what is done.
+    """One window at a time, causal except for the initialisation (at most 30 s); an interrupt keeps what is done.
 
     Raises
     ------
@@ -48,40 +45,28 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     progress("finding the start", 0, 0)
     initial = initialise(problem, longest_s=30.0)
     clock.lap("initialise")
-    options = problem.config.replay
-    smoother = incremental(options, problem.session.t0_ns)
-    builders = [initial.prior.placed(), *problem.builders]
-    wandering = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.pass_state))
-    pass_state = replace(initial.pass_state, phase=Phase.CAUSAL, correlated=wandering, stage=LAST_STAGE)
-    log = UpdateLog()
-    states: list[State] = []
+    smoother = incremental(problem.config.replay, problem.session.t0_ns)
+    builders, log = [initial.prior.with_position(), *problem.builders], UpdateLog(smoother)
     interrupted = False
     try:
-        with _no_collection():  # a pause of Python's would be a late update
-            for window in watched("replay", problem.windows, progress):
-                begin = time.perf_counter()
-                previous = states[-1] if states else None
-                update = build_update(window, previous, builders, pass_state, problem.session.t0_ns)
-                smoother.update(update)
-                states.append(smoother.known())
-                log.take(update, smoother, time.perf_counter() - begin)
+        run_pass(smoother, watched("replay", problem.windows, progress), builders, _causal(problem, initial), log.take)
     except KeyboardInterrupt:
         interrupted = True
-        if len(states) < 2:
+        if len(log.states) < 2:
             raise
     clock.lap("replay")
-    problem = _counted(replace(problem, windows=problem.windows[: len(states)]), smoother.dropped)
-    estimate = smoother.estimate(len(states))
-    causal, windows, updates = causal_solution(problem, states), problem.windows, log.updates()
+    count, last_ns = len(log.states), log.states[-1].t_ns if interrupted else None
+    problem = _counted(replace(problem, windows=problem.windows[:count]), smoother.dropped)
+    estimate, pass_state = smoother.estimate(count), _causal(problem, initial)
+    causal, windows, updates = causal_solution(problem, log.states), problem.windows, log.updates()
     extra: dict[str, Any] = {
-        "mode": f"replay {options.smoother}" + (", interrupted" if interrupted else ""),
+        "mode": f"replay {problem.config.replay.smoother}" + (", interrupted" if interrupted else ""),
         "update_ms": {name: float(f(log.latency_ms)) for name, f in _LATENCY.items()},
         "delay_s": initial.stretch_s,
     }
-    if options.polish:
+    if problem.config.replay.polish:
         try:
-            last = problem.windows[-1].t1_ns if interrupted else None
-            problem, estimate, pass_state, extra["polish"] = _polished(problem, estimate, initial, last, progress)
+            problem, estimate, pass_state, extra["polish"] = _polished(problem, estimate, initial, last_ns, progress)
         except KeyboardInterrupt:
             extra["mode"] += ", polish interrupted"
         clock.lap("polish")
@@ -89,8 +74,14 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     return replace(run, causal_windows=windows)
 
 
+def _causal(problem: Problem, initial: InitialState) -> PassState:
+    """The pass state of a replay: everything takes part from the start."""
+    correlated = frozenset(b.name for b in position_builders(problem.builders) if b.wanders(initial.pass_state))
+    return replace(initial.pass_state, phase=Phase.CAUSAL, correlated=correlated, stage=LAST_STAGE)
+
+
 def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:
-    """The problem with the rows that came too late for the smoother."""
+    """The problem with the rows counted that were older than the lag."""
     streams = problem.session.streams()
     counts = {name: count for name, count in too_late.items() if count and name in streams}
     return problem.with_dropped(TOO_LATE, counts)
@@ -99,23 +90,23 @@ def _counted(problem: Problem, too_late: Mapping[str, int]) -> Problem:
 def _polished(
     problem: Problem, estimate: Estimate, initial: InitialState, available_ns: int | None, progress: Progress
 ) -> tuple[Problem, Estimate, PassState, dict[str, float]]:
-    """Everything once more by batch, every row at the time it speaks of, and how far that moved the estimate.
+    """Everything once more by batch, every row at its measurement time, and how far that moved the estimate.
 
-    What is made at the states before (preintegrated windows, delayed fixes) is made anew where they moved far.
+    What is linearised at earlier states (preintegrated windows, delayed fixes) is built again where they moved far.
     """
-    whole = recut(problem, available_ns)
+    whole = batch_problem(problem, available_ns)
     initial_values = estimate.values if whole is problem else carried_over(problem, estimate, whole.windows)
     pass_state, total = initial.pass_state, 0
-    told: dict[str, float] = {}
+    moved: dict[str, float] = {}
     while True:
         found, pass_state, passes = solve_passes(
             whole, whole.windows, initial.prior, pass_state, initial_values=initial_values, progress=progress
         )
         metres, degrees = distance(states_of(initial_values, found.indices), found.states())
-        told = told or {"largest_change_m": metres, "largest_change_deg": degrees}
+        moved = moved or {"largest_change_m": metres, "largest_change_deg": degrees}
         total += passes
         if (metres < FAR_M and degrees < FAR_DEG) or total >= whole.config.run.passes:
-            return whole, found, pass_state, {**told, "passes": total}
+            return whole, found, pass_state, {**moved, "passes": total}
         initial_values = found.values
 
 

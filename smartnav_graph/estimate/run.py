@@ -11,7 +11,7 @@ from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate.alignment.initial_state import InitialState, UserStart
 from smartnav_graph.estimate.alignment.inputs import initialiser_of
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.passes import Clock, _forget, _window_by_window, solve_passes
+from smartnav_graph.estimate.passes import Clock, causal_start, solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     Withheld,
@@ -81,9 +81,7 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     initial = initialise(problem)
     initial_values, pass_state = initial.initial_values, initial.pass_state
     if not problem.session.absolute():
-        builders = [initial.prior, *problem.builders]
-        initial_values, pass_state = _window_by_window(problem, problem.windows, builders, pass_state, progress)
-    _forget(problem.builders)
+        initial_values, pass_state = causal_start(problem, problem.windows, initial.prior, pass_state, progress)
     clock.lap("initialise")
     estimate, pass_state, passes = solve_passes(
         problem,

@@ -98,6 +98,14 @@ class Kept(NamedTuple):
 
 
 @dataclass
+class Preintegrated:
+    """Windows preintegrated in earlier passes, by index, and the wall seconds that all of it took."""
+
+    windows: dict[int, Kept] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+@dataclass
 class ImuBuilder:
     """Adds `ImuFactor` and the bias walk, and predicts the state at the window's end.
 
@@ -113,8 +121,7 @@ class ImuBuilder:
     name: str = "imu"
     stage: int = 0
     weight: float = CLASS_WEIGHT
-    _spent_s: float = 0.0
-    _kept: dict[int, Kept] = field(default_factory=dict)
+    cache: Preintegrated = field(default_factory=Preintegrated)
     _straying: gap_error.Straying = field(default_factory=gap_error.Straying)
 
     def grows(self, pass_state: PassState) -> bool:
@@ -164,12 +171,12 @@ class ImuBuilder:
         """GTSAM preintegrated measurements of one window, linearised at `bias` or, where that is good enough, as an
         earlier pass left them."""
         scales, vector = (pass_state.scale("accel"), pass_state.scale("gyro")), bias.vector()
-        kept = self._kept.get(window.index)
+        kept = self.cache.windows.get(window.index)
         fresh = kept is not None and kept.window is window and (np.abs(vector - kept.bias) < KEPT_BIAS).all()
         if kept is not None and fresh and (kept.scales == scales or window.kind != "gap"):
             return kept.pim
         pim = self._integrated(window, bias, pass_state)
-        self._kept[window.index] = Kept(window, vector, scales, pim)
+        self.cache.windows[window.index] = Kept(window, vector, scales, pim)
         return pim
 
     def _integrated(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> Any:
@@ -178,17 +185,12 @@ class ImuBuilder:
         integrate = pim.integrateMeasurement
         for accel, gyro, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
             integrate(accel, gyro, dt)
-        self._spent_s += time.perf_counter() - begin
+        self.cache.seconds += time.perf_counter() - begin
         return pim
-
-    def spent(self) -> float:
-        """Wall seconds of preintegration since the last call."""
-        seconds, self._spent_s = self._spent_s, 0.0
-        return seconds
 
     def _covariance(self, window: Window, pim: Any, pass_state: PassState) -> Floats:
         """Covariance (9, 9) of a window with the noise of `pass_state`, whatever noise it was preintegrated with."""
-        scales, old = (pass_state.scale("accel"), pass_state.scale("gyro")), self._kept[window.index].scales
+        scales, old = (pass_state.scale("accel"), pass_state.scale("gyro")), self.cache.windows[window.index].scales
         covariance: Floats = pim.preintMeasCov()
         if scales == old:
             return covariance
@@ -201,7 +203,7 @@ class ImuBuilder:
         """Factor of a window with the noise of `pass_state`."""
         i, j = window.index - 1, window.index
         factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
-        if (pass_state.scale("accel"), pass_state.scale("gyro")) == self._kept[j].scales:
+        if (pass_state.scale("accel"), pass_state.scale("gyro")) == self.cache.windows[j].scales:
             return factor
         model = gtsam.noiseModel.Gaussian.Covariance(self._covariance(window, pim, pass_state))
         return factor.cloneWithNewNoiseModel(model)

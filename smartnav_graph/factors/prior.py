@@ -60,10 +60,9 @@ class PriorBuilder:
     name: str = "prior"
     stage: int = 0
 
-    def placed(self) -> PriorBuilder:
-        """The same for a smoother that solves at the first keyframe and cannot wait for the first fix: a position sigma
-        of 100 km where there is none, and the bias found at the start as the mean of its wide prior where no rest gave
-        one."""
+    def with_position(self) -> PriorBuilder:
+        """The same for an incremental smoother, which solves at the first keyframe, before the first fix: a position
+        sigma of 100 km where there is none, and the bias of `start` as the mean of its prior unless a rest gave it."""
         place = np.full(3, UNKNOWN_PLACE) if self.sigma_pos is None else self.sigma_pos
         mean = self.start.bias if self.rest_end_ns is None else self.bias_mean
         return replace(self, sigma_pos=place, bias_mean=mean)

@@ -1,4 +1,4 @@
-"""One interface, three smoothers: `latest()`, `update(step)`, `estimate()`."""
+"""One interface, three smoothers: `latest()`, `update(update)`, `estimate()`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from smartnav_graph.smoothers.isam2 import Isam2
 
 
 class Smoother(Protocol):
-    """Takes steps in time order and knows no sensor."""
+    """Takes updates in time order and knows no sensor. t0_ns : time zero of the session"""
+
+    t0_ns: int
 
     def latest(self) -> State | None:
         """State at the last keyframe, None before the first."""
         ...
 
     def update(self, update: GraphUpdate) -> None:
-        """Take one step."""
+        """Take one update."""
         ...
 
     def estimate(self) -> Estimate:

@@ -61,6 +61,7 @@ class Incremental(ABC):
         self.steps: list[GraphUpdate] = []
         self.dropped: Counter[str] = Counter()
         self.effort = Effort()
+        self._latest: State | None = None
 
     @abstractmethod
     def _take(self, update: GraphUpdate) -> None:
@@ -107,17 +108,15 @@ class Incremental(ABC):
             touching = {s.index: s.sensors() for s in [*self.steps, update]}
             raise indeterminate(error, t_ns, self.t0_ns, touching) from error
         self.steps.append(update)
+        self._latest = None
 
     def latest(self) -> State | None:
-        """State at the last keyframe, with everything known so far."""
-        return self._state(self.steps[-1]) if self.steps else None
-
-    def known(self) -> State:
-        """State of the latest keyframe with its covariance."""
-        step = self.steps[-1]
-        state, joint = self._state(step), self._marginal(step)
-        R = state.nav.attitude().matrix()
-        return replace(state, covariance=to_nav_axes(joint[None], R[None])[0])
+        """State at the last keyframe with its covariance, after everything taken so far."""
+        if self._latest is None and self.steps:
+            state, joint = self._state(self.steps[-1]), self._marginal(self.steps[-1])
+            R = state.nav.attitude().matrix()
+            self._latest = replace(state, covariance=to_nav_axes(joint[None], R[None])[0])
+        return self._latest
 
     def estimate(self, count: int | None = None) -> Estimate:
         """The first `count` keyframes (all by default) at `values`, with the covariance of their graph linearised

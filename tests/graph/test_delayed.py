@@ -11,7 +11,7 @@ from sessions import on_control, positions, recorded, with_gnss, with_imu
 import smartnav_graph as sn
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.problem import prepare, recut
+from smartnav_graph.estimate.problem import batch_problem, prepare
 from smartnav_graph.estimate.replay import replay
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.graph import delayed
@@ -113,10 +113,10 @@ def test_no_keyframe_stands_where_nobody_knew_of_a_row():
     assert np.isin(session.gnss.t_ns, causal_ns).sum() <= 2  # the start, and a border of the rest
     assert sum(len(w.delayed.get("gnss", ())) for w in causal.windows) == len(known)
     assert causal.dropped == {"gnss": {"arrived after the end": 1}} and batch.dropped == {}
-    again = recut(causal)
+    again = batch_problem(causal)
     assert [(w.t1_ns, dict(w.rows)) for w in again.windows] == [(w.t1_ns, dict(w.rows)) for w in batch.windows]
     prompt = prepare(recorded(), options, causal=True)
-    assert recut(prompt) is prompt
+    assert batch_problem(prompt) is prompt
 
 
 @pytest.mark.parametrize("smoother", ["isam2", "fixed-lag"])

@@ -13,7 +13,7 @@ from exact import record
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.passes import one_pass, solve_passes
+from smartnav_graph.estimate.passes import run_pass, solve_passes
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
@@ -45,10 +45,10 @@ def problem():
 @pytest.fixture(scope="module")
 def steps(problem):
     """Steps built once, at the batch solution: preintegration and delays depend on the state they are made at."""
-    prior = initialise(problem, 30.0).prior.placed()
+    prior = initialise(problem, 30.0).prior.with_position()
     solved, _, _ = solve_passes(problem, problem.windows, prior, ALL)
     smoother = Batch(initial_values=solved.values, t0_ns=problem.session.t0_ns)
-    one_pass(smoother, problem.windows, [prior, *problem.builders], ALL, problem)
+    run_pass(smoother, problem.windows, [prior, *problem.builders], ALL)
     for update in smoother.steps:
         update.refresh = None  # never again
     return smoother.steps
@@ -110,7 +110,7 @@ def test_session_states_converge_behind_a_short_lag(steps, batch):
     for name, state in batch.session.items():
         found = estimate.session[name]
         assert (np.abs(found.value - state.value) < 0.15 * state.sigma).all(), name
-    last = smoother.known()
+    last = smoother.latest()
     assert np.linalg.norm(last.nav.position() - batch.states()[1][-1]) < 0.2 * np.sqrt(
         np.trace(batch.covariance[-1][3:6, 3:6])
     )
@@ -138,7 +138,7 @@ def test_a_session_state_is_inserted_once_and_the_window_stays_small(steps):
 
 def test_marginalising_keeps_the_latest_covariance(steps):
     """To first order nothing is lost: with and without a lag, linearised near the same point."""
-    short, long = (replayed(steps[:25], lag_s=lag).known() for lag in (4.0, 1e3))
+    short, long = (replayed(steps[:25], lag_s=lag).latest() for lag in (4.0, 1e3))
     scale = np.sqrt(np.outer(np.diag(long.covariance), np.diag(long.covariance)))
     assert np.abs((short.covariance - long.covariance) / scale).max() < 0.03
 
@@ -216,9 +216,9 @@ def test_a_broken_measurement_is_told_with_its_time(steps):
 
 def test_steps_are_built_on_what_is_known(problem):
     """End to end: the loop's own order of latest, build, update."""
-    prior = initialise(problem, 30.0).prior.placed()
+    prior = initialise(problem, 30.0).prior.with_position()
     smoother = incremental(ReplayConfig("fixed-lag", lag_s=8.0), problem.session.t0_ns)
     for window in problem.windows[:20]:
         update = build_update(window, smoother.latest(), [prior, *problem.builders], ALL, problem.session.t0_ns)
         smoother.update(update)
-        assert smoother.latest().index == window.index and np.isfinite(smoother.known().covariance).all()
+        assert smoother.latest().index == window.index and np.isfinite(smoother.latest().covariance).all()

@@ -27,7 +27,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def prior(problem):
-    return initialise(problem, 30.0).prior.placed()
+    return initialise(problem, 30.0).prior.with_position()
 
 
 def fill(problem, prior, smoother, watch=lambda smoother: None):
@@ -43,7 +43,7 @@ def test_the_last_state_is_that_of_batch(problem, prior, kind):
     """Everything is known at the end: the newest state is the smoothed one, up to what a lag froze."""
     smoother = fill(problem, prior, incremental(ReplayConfig(kind), problem.session.t0_ns))
     batch = fill(problem, prior, Batch(t0_ns=problem.session.t0_ns)).estimate()
-    known = smoother.known()
+    known = smoother.latest()
     assert known.nav.position() == pytest.approx(batch.states()[1][-1], abs=0.02)  # m; a tenth of a fix
     sigma, full = (np.sqrt(np.diag(c)) for c in (known.covariance, batch.covariance[-1]))
     assert sigma[:9] == pytest.approx(full[:9], rel=0.05)

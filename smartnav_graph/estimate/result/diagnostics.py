@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +15,7 @@ from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.graph.pass_state import PassState
-from smartnav_graph.graph.states import indices_of, letters_of
+from smartnav_graph.graph.states import State, indices_of, letters_of
 from smartnav_graph.graph.update import GraphUpdate, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.incremental import Incremental
@@ -97,15 +98,20 @@ class Updates:
 
 @dataclass
 class UpdateLog:
-    """Collects `Updates` while a replay runs."""
+    """Collects `Updates` and the latest state after each while a replay runs."""
 
+    smoother: Incremental
+    states: list[State] = field(default_factory=list)
     _rows: list[tuple[int, int, int, int, float, float]] = field(default_factory=list)
     _windows: list[tuple[Ints, Floats]] = field(default_factory=list)
     _states: list[Mapping[str, tuple[float, float]]] = field(default_factory=list)
 
-    def take(self, update: GraphUpdate, smoother: Incremental, latency_s: float) -> None:
-        """Remember the update that `step` led to."""
-        window = smoother.recent()
+    def take(self, update: GraphUpdate, begin_s: float) -> None:
+        """Record what `update` led to; it was begun at `begin_s` (time.perf_counter)."""
+        smoother, state = self.smoother, self.smoother.latest()
+        assert state is not None
+        self.states.append(state)
+        latency_s, window = time.perf_counter() - begin_s, smoother.recent()
         corrected = _largest_move(self._windows[-1], window) if self._windows else 0.0
         effort = smoother.effort
         row = (update.t_ns, effort.solved, effort.relinearised, doubted_rows(update), corrected, 1e3 * latency_s)

@@ -76,9 +76,9 @@ def _judged(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassSta
     )
 
 
-def lost(builders: Iterable[Builder], estimate: Estimate) -> bool:
-    """Whether the way between images is so poorly known that what they say of it may be far: a redescending loss does
-    not find the way back, and a baseline fits as well the other way round."""
+def images_diverged(builders: Iterable[Builder], estimate: Estimate) -> bool:
+    """Whether the motion between images is too uncertain for image pairs: a redescending loss does not converge from
+    so far, and a baseline fits as well with the opposite sign."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None:
         return False

@@ -54,9 +54,7 @@ STEADY_INERTIAL = 0.1
 GROWTH = 4.0
 GRADUATED_PASSES = 14
 
-# Sigma (m) of fixes under a redescending loss: as far as a stretch between fixes is foretold, and as far as outliers
-# bend least squares; and the share of it that the next pass has.
-WIDE_M, BENT_M = 3.0, 30.0
+# Share of the least sigma of fixes under a redescending loss that the next pass has.
 NARROWER = 0.1
 
 # A session state is held where the data leave more than this of its prior sigma.
@@ -107,8 +105,8 @@ def _revised(
     return grown, grown == tuned
 
 
-def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float = WIDE_M) -> PassState:
-    """The memory of a robust pass from a start that is off by so many metres."""
+def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float) -> PassState:
+    """The pass state of a robust pass from a start that is off by so many metres."""
     sigmas = [float(np.median(b.scaled_sigma(pass_state)[:, :2])) for b in position_builders(builders) if b.gated]
     return replace(pass_state, robust_floor_m=metres if min(sigmas, default=metres) < metres / 3 else 0.0)
 
