@@ -42,3 +42,11 @@ BUILDERS: Mapping[str, Callable[[FactorContext], Builder | None]] = {
     "coplanarity": coplanarity.build,
     "smart": smart.build,
 }
+
+# Sensors of factors that do not begin with the name of their builder.
+_OF_OTHERS = {"rest": "prior", "pace": "gravity"}
+
+
+def builder_of(sensor: str) -> str:
+    """The builder of a factor, from the sensor of its id: ``imu_bias`` comes from ``imu``."""
+    return sensor if sensor in BUILDERS else _OF_OTHERS.get(sensor, sensor.split("_")[0])

@@ -58,6 +58,14 @@ def loss_weights(square: Floats, loss: str, reach: Floats | float = 1.0, dim: in
     return np.where(outside, limit / norm, 1.0), scale * cost
 
 
+@lru_cache
+def expected_weighted_square(loss: str, dim: int) -> float:
+    """E[w r^2] / dim of a standard normal row of `dim` components under a loss: what its weighted square is on average
+    where its sigma is right."""
+    square = chi2(dim).ppf((np.arange(10_000) + 0.5) / 10_000)
+    return float((loss_weights(square, loss, 1.0, dim)[0] * square).mean() / dim)
+
+
 def robust(model: gtsam.noiseModel.Base, loss: str, reach: float = 1.0) -> gtsam.noiseModel.Base:
     """A GTSAM noise model under a loss, as `loss_weights` has it."""
     if loss == "none":

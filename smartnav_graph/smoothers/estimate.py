@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -191,7 +191,32 @@ def eliminated(graph: Any, values: Any, steps: Sequence[GraphUpdate]) -> Any:
 
 
 def posterior(net: Any, steps: Sequence[GraphUpdate]) -> Posterior:
-    """Marginals by recursion over a Bayes net eliminated in chronological order, session states last.
+    """Marginals of a Bayes net eliminated in chronological order, session states last; see `joint_covariances`.
+
+    Raises
+    ------
+    RuntimeError
+        A keyframe is not determined.
+    """
+    groups, session = [update.names() for update in steps], list(session_states(steps))
+    joint, following = np.empty((len(steps), 15, 15)), np.empty((max(len(steps) - 1, 0), 15, 15))
+    later: dict[int, Floats] = {}
+    for row, found in joint_covariances(net, groups, session):
+        if row == len(steps):
+            later = {name: found.of([name]) for name in session}
+            continue
+        joint[row] = found.covariance[:15, :15]
+        if row < len(following):
+            at = found.at[groups[row + 1][0]].start
+            following[row] = found.covariance[:15, at : at + 15]
+    return Posterior(joint, following, later)
+
+
+def joint_covariances(
+    net: Any, groups: Sequence[Sequence[int]], session: Sequence[int]
+) -> Iterator[tuple[int, JointCovariance]]:
+    """Joint covariance of the session states (row n), then of each of the n groups of states, backwards in time, with
+    all later states that a factor shares with it.
 
     Each keyframe is conditioned on what comes later, R x_k + S y = d; backwards in time P_k = R^-1 R^-T + K P_y K^T
     and P_ky = -K P_y with K = R^-1 S. One small product a keyframe, and stable where nothing holds the trajectory (a
@@ -199,29 +224,21 @@ def posterior(net: Any, steps: Sequence[GraphUpdate]) -> Posterior:
 
     Source: Rauch, Tung, Striebel (1965), in square-root information form (Bierman 1977, ch. X).
 
-    Raises
-    ------
-    RuntimeError
-        A keyframe is not determined.
+    Parameters
+    ----------
+    groups : keys of the states of each keyframe, in the order of the elimination; session : those eliminated last
     """
     conditionals = {net.at(i).keys()[0]: net.at(i) for i in range(net.size())}
-    groups = [update.names() for update in steps]
-    last_use = _earliest_users(groups, conditionals)
-    session = list(session_states(steps))
-    live, later = _Joint.empty(), {}
+    first_use = _earliest_users(groups, conditionals)
+    found = JointCovariance({}, np.zeros((0, 0)))
     if session:
-        live = live.before(_slices(session), conditionals)
-        later = {name: live.of(name) for name in session}
-    joint, following = np.empty((len(steps), 15, 15)), np.empty((max(len(steps) - 1, 0), 15, 15))
-    for row in reversed(range(len(steps))):
-        new, cross = live.conditioned(_slices(groups[row]), conditionals)
-        joint[row] = new[:15, :15]
-        if row < len(following):
-            at = live.at[groups[row + 1][0]].start
-            following[row] = cross[:15, at : at + 15]
-        keep = [name for name in live.at if last_use.get(name, row) < row]
-        live = live.extended(groups[row], new, cross, keep)
-    return Posterior(joint, following, later)
+        found = found.extended(session, conditionals)
+    yield len(groups), found
+    following: Sequence[int] = ()
+    for row in reversed(range(len(groups))):
+        kept = [name for name in found.at if name in following or first_use.get(name, row + 1) <= row]
+        found, following = found.only(kept).extended(groups[row], conditionals), groups[row]
+        yield row, found
 
 
 def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
@@ -232,7 +249,7 @@ def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
         conditional = net.at(place)
         conditionals[conditional.keys()[0]] = conditional
         missing.discard(conditional.keys()[0])
-    return _Joint.empty().conditioned(_slices(names), conditionals)[0]
+    return JointCovariance({}, np.zeros((0, 0))).extended(names, conditionals).covariance
 
 
 def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, Any]) -> dict[int, int]:
@@ -246,21 +263,24 @@ def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, 
 
 
 @dataclass(frozen=True)
-class _Joint:
-    """Joint covariance of the states that earlier ones are still conditioned on."""
+class JointCovariance:
+    """Joint covariance of some states, on GTSAM's tangents; at : rows of each state, by key."""
 
     at: dict[int, slice]
     covariance: Floats
 
-    @classmethod
-    def empty(cls) -> _Joint:
-        return cls({}, np.zeros((0, 0)))
+    def of(self, names: Sequence[int]) -> Floats:
+        """The covariance of the states `names`, in their order."""
+        columns = np.array([i for name in names for i in range(self.at[name].start, self.at[name].stop)], dtype=np.intp)
+        return np.asarray(self.covariance[np.ix_(columns, columns)])
 
-    def of(self, name: int) -> Floats:
-        return self.covariance[self.at[name], self.at[name]]
+    def only(self, names: Sequence[int]) -> JointCovariance:
+        """The same without all other states."""
+        return self if len(names) == len(self.at) else JointCovariance(_slices(names), self.of(names))
 
-    def conditioned(self, at: dict[int, slice], conditionals: Mapping[int, Any]) -> tuple[Floats, Floats]:
-        """Covariance of a new group and its cross covariance with the states of this joint."""
+    def extended(self, names: Sequence[int], conditionals: Mapping[int, Any]) -> JointCovariance:
+        """With the states `names` before these, which they are conditioned on."""
+        at = _slices(names)
         size = max(part.stop for part in at.values())
         R, S = np.zeros((size, size)), np.zeros((size, len(self.covariance)))
         for name, part in at.items():
@@ -280,21 +300,8 @@ class _Joint:
         inverse = np.linalg.inv(R)
         gain = inverse @ S
         cross = -gain @ self.covariance
-        return inverse @ inverse.T - cross @ gain.T, cross
-
-    def before(self, at: dict[int, slice], conditionals: Mapping[int, Any]) -> _Joint:
-        """The joint of one more group and nothing else."""
-        return _Joint(at, self.conditioned(at, conditionals)[0])
-
-    def extended(self, names: Sequence[int], own: Floats, cross: Floats, keep: Sequence[int]) -> _Joint:
-        """The joint of a new group and the states `keep` of this one."""
-        at = _slices(names)
-        if not keep:
-            return _Joint(at, own)
-        columns = np.concatenate([np.arange(self.at[name].start, self.at[name].stop) for name in keep])
-        held = cross[:, columns]
-        joint = np.block([[own, held], [held.T, self.covariance[np.ix_(columns, columns)]]])
-        return _Joint(_slices([*names, *keep]), joint)
+        own = inverse @ inverse.T - cross @ gain.T
+        return JointCovariance(_slices([*names, *self.at]), np.block([[own, cross], [cross.T, self.covariance]]))
 
 
 def _slices(names: Iterable[int]) -> dict[int, slice]:

@@ -14,6 +14,7 @@ import numpy as np
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.result.assemble import Withheld, used_counts
+from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
 from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight import track_outliers
@@ -21,7 +22,6 @@ from smartnav_graph.estimate.reweight.constraint_noise import noise_groups
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
-from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
 from smartnav_graph.estimate.reweight.update import OBSERVED
 from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
 from smartnav_graph.factors.gauss_markov import wander_sigma
@@ -30,7 +30,6 @@ from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.smoothers.estimate import Estimate
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
-STATE_DIM = 15
 # Chi-square per degree of freedom that no tolerable noise model explains: residuals twice their sigma.
 MISFIT = 4.0
 
@@ -50,50 +49,6 @@ def peak_memory_mb() -> float:
     """Largest resident set of this process, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
-
-
-def _chi2_per_dof(
-    solved: SolvedProblem, solution: Solution, seen: Account | None, tracks: track_outliers.Account | None
-) -> dict[str, float]:
-    """Sum of squares over redundancy: of everything, of each sensor of positions, and of the inertial rest.
-
-    Unknowns are the states less the equations that chains and priors bring with them. The redundancy of a fix is what
-    its posterior leaves of its variance; the inertial factors have the rest.
-    """
-    estimate, pass_state = solved.estimate, solved.pass_state
-    rows = {
-        sensor: solution.residuals.of(sensor) & solution.residuals.used for sensor in set(solution.residuals.sensor)
-    }
-    squares = {
-        sensor: float((solution.residuals.weight[mask] * solution.residuals.whitened[mask] ** 2).sum())
-        for sensor, mask in rows.items()
-    }
-    count = sum(int(mask.sum()) for mask in rows.values())
-    # the position is free of any prior; each chain and session state has one equation of its own
-    eliminated = POINT_DOF * tracks.points if tracks is not None and tracks.in_force else 0
-    total = max(count - eliminated - STATE_DIM * len(estimate.indices) + 12, 1)
-    result = {"overall": 2.0 * estimate.cost / total}
-    left = float(total)
-    if seen is not None and seen.redundancy > 0:
-        left -= seen.redundancy
-        inside = rows.get("coplanarity", np.zeros(0, dtype=bool))  # within their gate; the loss would make it too small
-        result["coplanarity"] = float((solution.residuals.whitened[inside] ** 2).sum()) / seen.redundancy
-    if tracks is not None and tracks.in_force:
-        left -= tracks.redundancy
-        result[SMART] = squares.get(SMART, 0.0) / tracks.redundancy
-    for builder in position_builders(solved.problem.builders):
-        if builder.name in pass_state.correlated:
-            continue
-        found = solved.fixes[builder.name]
-        used = pass_state.used(builder.name, found.rows)
-        redundancy = float(found.redundancy[used].sum())
-        left -= redundancy
-        if redundancy > 0.5:
-            result[builder.name] = squares.get(builder.name, 0.0) / redundancy
-    inertial = squares.get("imu", 0.0) + squares.get("imu_bias", 0.0)
-    if left > 0.5 and not pass_state.correlated:
-        result["imu"] = inertial / left
-    return {name: round(value, 5) for name, value in result.items()}
 
 
 def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
@@ -132,7 +87,8 @@ def summarise(
         factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, pass_state))
     seen, tracks = account(problem.builders, pass_state), track_outliers.account(problem.builders, pass_state)
-    chi2 = _chi2_per_dof(solved, keyframes, seen, tracks)
+    fit = chi2_of(solved, keyframes, tracks)
+    chi2 = fit.per_dof()
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     told = [one.refused for one in (seen, tracks) if one is not None and one.refused]
@@ -153,6 +109,8 @@ def summarise(
         "keyframes": len(keyframes),
         "factors": factors,
         "chi2_per_dof": chi2,
+        "redundancy": {name: round(part.redundancy, 3) for name, part in fit.parts.items()},
+        "without_chi2": fit.reasons(),
         "iterations": estimate.iterations,
         "converged": estimate.converged,
         "cost": estimate.cost,

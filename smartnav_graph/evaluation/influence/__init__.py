@@ -13,12 +13,13 @@ that touch the keyframe if all its neighbours were known. P without the rows of 
 Source: Teunissen (2003), Adjustment theory, 2.4; Cook, Weisberg (1982), Residuals and Influence in Regression, 2.
 """
 
-from smartnav_graph.evaluation.influence.factors import CALIBRATION, FACTORS, KEYFRAMES, Group, Influence, Keyframes
+from smartnav_graph.evaluation.influence.factors import FACTORS, KEYFRAMES, Group, Influence, Keyframes
 from smartnav_graph.evaluation.influence.keyframe_influence import (
     KeyframeInfluence,
     Measurements,
     influence_of_keyframe,
 )
+from smartnav_graph.smoothers.redundancy import CALIBRATION
 
 __all__ = [
     "CALIBRATION",

@@ -17,20 +17,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.factors import BUILDERS
+from smartnav_graph.factors import builder_of
 from smartnav_graph.graph.states import STATES, letters_of
 from smartnav_graph.graph.update import FactorId
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.redundancy import CALIBRATION
 from smartnav_graph.smoothers.whole_graph import StackedFactors
 
 Names = NDArray[np.uint64]
 
 FACTORS, KEYFRAMES = "influence.parquet", "keyframes.parquet"
-# Source of the priors of the session's states (clock offsets, lever arms, mounts).
-CALIBRATION = "calibration"
-# Sensors of factors that do not begin with the name of their builder.
-_OF_OTHERS = {"rest": "prior", "pace": "gravity"}
 
 
 class Group(NamedTuple):
@@ -116,11 +113,6 @@ class Influence:
         kind = np.array(table.column("kind").to_pylist(), dtype=object)
         keyframes = Keyframes(index, t_ns, kind, Rotation.from_quat(quaternions).as_matrix())
         return cls(list(_grouped(pq.read_table(folder / FACTORS).combine_chunks())), keyframes)
-
-
-def builder_of(tag: str) -> str:
-    """The builder of a factor, from the sensor of its id: ``imu_bias`` comes from ``imu``."""
-    return tag if tag in BUILDERS else _OF_OTHERS.get(tag, tag.split("_")[0])
 
 
 def _native(estimate: Estimate) -> Iterator[Group]:

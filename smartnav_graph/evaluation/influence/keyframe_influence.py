@@ -13,7 +13,8 @@ from scipy.sparse.linalg import splu
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SolverError
-from smartnav_graph.evaluation.influence.factors import Influence, builder_of
+from smartnav_graph.evaluation.influence.factors import Influence
+from smartnav_graph.factors import builder_of
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, indices_of, letters_of
 
 # Without a source a component is not observable if its sigma grows by more than this factor.

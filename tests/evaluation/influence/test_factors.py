@@ -5,7 +5,7 @@ import pytest
 
 import smartnav_graph as sn
 from smartnav_graph.evaluation.influence import Influence, influence_of_keyframe
-from smartnav_graph.evaluation.influence.factors import builder_of
+from smartnav_graph.factors import builder_of
 
 OPTIONS = {"end_s": 20.0, "initial": "0,0,0,0,3,30"}
 

@@ -1,0 +1,108 @@
+"""Chi-square per degree of freedom of every sensor, each by its own redundancy (`smoothers.redundancy`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from smartnav_graph.estimate.result.solved import SolvedProblem
+from smartnav_graph.estimate.reweight import track_outliers
+from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
+from smartnav_graph.factors import builder_of
+from smartnav_graph.factors.coplanarity import SMART
+from smartnav_graph.graph.robust import expected_weighted_square
+from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
+
+# Redundancy below which a sum of squares tells nothing of a sensor's noise.
+LEAST_REDUNDANCY = 1.0
+# Image pairs: matches within their gate count in full, their loss would make the sum too small.
+UNWEIGHTED = "coplanarity"
+
+
+@dataclass(frozen=True)
+class Part:
+    """The factors of one builder: residuals (their number), redundancy, and the sum of squares of their whitened
+    residuals, in units of what a row under its loss has on average where its sigma is right."""
+
+    residuals: int = 0
+    redundancy: float = 0.0
+    square: float = 0.0
+
+
+@dataclass(frozen=True)
+class Chi2:
+    """Sums of squares and redundancy by builder, priors too; cost : of the whole graph."""
+
+    cost: float
+    parts: Mapping[str, Part]
+
+    @property
+    def dof(self) -> float:
+        """Residuals of the whole graph, priors too, less its unknowns."""
+        return sum(part.redundancy for part in self.parts.values())
+
+    def per_dof(self) -> dict[str, float]:
+        """``overall`` and every sensor that has redundancy; 1 is expected."""
+        found = {"overall": 2.0 * self.cost / max(self.dof, 1.0)}
+        found |= {name: part.square / part.redundancy for name, part in self._sensors().items() if _enough(part)}
+        return {name: round(value, 5) for name, value in found.items()}
+
+    def reasons(self) -> dict[str, str]:
+        """Why a sensor has no chi-square."""
+        return {
+            name: f"redundancy {part.redundancy:.2f} of {part.residuals} residuals: the solution follows them"
+            for name, part in self._sensors().items()
+            if not _enough(part)
+        }
+
+    def _sensors(self) -> dict[str, Part]:
+        return {name: part for name, part in self.parts.items() if name not in ("prior", CALIBRATION)}
+
+
+def _enough(part: Part) -> bool:
+    return part.redundancy >= LEAST_REDUNDANCY
+
+
+def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.Account | None) -> Chi2:
+    """Of a solved problem and the residuals of its keyframes."""
+    parts: dict[str, Part] = {}
+    for name, found in redundancies(solved.estimate).items():
+        count, square = _squares(solved, solution.residuals, name)
+        count = count or found.residuals  # of priors, which have no row among the residuals
+        if name == SMART and tracks is not None:
+            count -= POINT_DOF * tracks.points
+        builder = builder_of(name)
+        before = parts.get(builder, Part())
+        parts[builder] = replace(
+            before,
+            residuals=before.residuals + count,
+            redundancy=before.redundancy + count - found.fitted,
+            square=before.square + square,
+        )
+    return Chi2(solved.estimate.cost, parts)
+
+
+def _squares(solved: SolvedProblem, residuals: Residuals, name: str) -> tuple[int, float]:
+    """Number of the residuals of one kind of factor in use, and the sum of their squares over its expectation."""
+    rows = residuals.of(name) & residuals.used
+    square = residuals.whitened[rows] ** 2
+    if name == UNWEIGHTED:
+        return int(rows.sum()), float(square.sum())
+    return int(rows.sum()), float((residuals.weight[rows] * square).sum()) / _expected(solved, name)
+
+
+def _expected(solved: SolvedProblem, name: str) -> float:
+    """Average weighted square of a residual under the losses of one kind of factor."""
+    loss = {builder.name: builder.config.loss for builder in position_builders(solved.problem.builders)}.get(name)
+    if loss is not None:
+        return expected_weighted_square("huber", 3) if loss == "huber" else 1.0
+    stacks = solved.estimate.stacks(name)
+    if not stacks:
+        return 1.0
+    dims = [stack.linearize(solved.estimate.values)[0].shape[1] for stack in stacks]
+    expected = [expected_weighted_square(stack.loss, dim) for stack, dim in zip(stacks, dims, strict=True)]
+    return float(np.average(expected, weights=[len(stack.keys) for stack in stacks]))

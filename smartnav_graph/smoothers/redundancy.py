@@ -1,0 +1,96 @@
+"""Redundancy of groups of factors: residuals of a group less what the solution fits of them.
+
+    redundancy = sum over the factors of (m - tr(J P J^T))
+
+J is the whitened Jacobian of m residuals, under the weight of its loss, and P the covariance of the solution: that of
+the states of one factor is part of the joint covariance at its first keyframe, so that the sum is exact. Over all
+factors, priors too, the redundancies add up to the number of residuals less that of unknowns.
+
+Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.2 (redundancy numbers).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, indices_of, key, kind_of
+from smartnav_graph.smoothers.estimate import Estimate, joint_covariances
+from smartnav_graph.smoothers.whole_graph import WholeGraph
+
+# Source of the priors of the session's states (clock offsets, lever arms, mounts).
+CALIBRATION = "calibration"
+
+
+class Redundancy(NamedTuple):
+    """Of the factors of one name: residuals (their number), and fitted, the sum of tr(J P J^T) over them."""
+
+    residuals: int
+    fitted: float
+
+    @property
+    def value(self) -> float:
+        return self.residuals - self.fitted
+
+    def __add__(self, other: Any) -> Redundancy:
+        return Redundancy(self.residuals + other.residuals, self.fitted + other.fitted)
+
+
+def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
+    """Redundancy by name of the factors' `FactorId`, and of the priors of the session states (`CALIBRATION`).
+
+    Raises
+    ------
+    RuntimeError
+        A keyframe is not determined.
+    """
+    names, linear = _linearized(estimate)
+    factors: dict[int, list[tuple[str, Any]]] = {}
+    session, groups = _states(linear, estimate)
+    place = {name: row for row, group in enumerate(groups) for name in group}
+    for i, name in enumerate(names):
+        factor = linear.at(i)
+        if factor is not None and not factor.empty():
+            first = min(place.get(state, len(groups)) for state in factor.keys())  # noqa: SIM118
+            factors.setdefault(first, []).append((name, factor))
+    order = gtsam.Ordering()
+    for state in [*(state for group in groups for state in group), *session]:
+        order.push_back(state)
+    found: dict[str, Redundancy] = {}
+    for row, joint in joint_covariances(linear.eliminateSequential(order, gtsam.EliminateQR), groups, session):
+        for name, factor in factors.get(row, ()):
+            J = factor.jacobian()[0]
+            fitted = float(((J @ joint.of(factor.keys())) * J).sum())
+            found[name] = found.get(name, Redundancy(0, 0.0)) + Redundancy(len(J), fitted)
+    return found
+
+
+def _linearized(estimate: Estimate) -> tuple[list[str], Any]:
+    """The name of every factor in use, and the linear system (gtsam.GaussianFactorGraph) of them in that order."""
+    free = [state for state in estimate.session.values() if not state.held]
+    held = {state.key: state.value for state in estimate.session.values() if state.held}
+    priors = [
+        gtsam.PriorFactorVector(state.key, state.prior_mean, gtsam.noiseModel.Diagonal.Sigmas(state.prior_sigma))
+        for state in free
+    ]
+    graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, held)
+    names = [tag.sensor for tag, _ in estimate.factors] + [CALIBRATION] * len(priors)
+    names += [stack.blocks[0].sensor for stack in graph.stacks for _ in range(int(stack.used.sum()))]
+    return names, graph.linearize(estimate.values)
+
+
+def _states(linear: Any, estimate: Estimate) -> tuple[list[int], list[list[int]]]:
+    """Keys of the session states of a linear system, and of the states of each keyframe."""
+    groups = {index: [key(letter, index) for letter in KEYFRAME_LETTERS] for index in estimate.indices}
+    names = np.array(sorted(linear.keys()), dtype=np.uint64)
+    session = []
+    for name, index in zip(names.tolist(), indices_of(names).tolist(), strict=True):
+        kind = kind_of(name)
+        if kind.scope == "session":
+            session.append(name)
+        elif kind.scope == "chain":
+            groups[index].append(name)
+    return session, list(groups.values())
