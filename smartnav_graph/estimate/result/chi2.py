@@ -54,7 +54,7 @@ class Chi2:
     def reasons(self) -> dict[str, str]:
         """Why a sensor has no chi-square."""
         return {
-            name: f"redundancy {part.redundancy:.2f} of {part.residuals} residuals: the solution follows them"
+            name: f"redundancy {abs(part.redundancy):.2f} of {part.residuals} residuals: the solution follows them"
             for name, part in self._sensors().items()
             if not _enough(part)
         }
