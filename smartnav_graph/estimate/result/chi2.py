@@ -24,7 +24,7 @@ UNWEIGHTED = "coplanarity"
 
 
 @dataclass(frozen=True)
-class Part:
+class SensorFit:
     """The factors of one builder: residuals (their number), redundancy, and the sum of squares of their whitened
     residuals, in units of what a row under its loss has on average where its sigma is right."""
 
@@ -38,7 +38,7 @@ class Chi2:
     """Sums of squares and redundancy by builder, priors too; cost : of the whole graph."""
 
     cost: float
-    parts: Mapping[str, Part]
+    parts: Mapping[str, SensorFit]
 
     @property
     def dof(self) -> float:
@@ -59,24 +59,24 @@ class Chi2:
             if not _enough(part)
         }
 
-    def _sensors(self) -> dict[str, Part]:
+    def _sensors(self) -> dict[str, SensorFit]:
         return {name: part for name, part in self.parts.items() if name not in ("prior", CALIBRATION)}
 
 
-def _enough(part: Part) -> bool:
+def _enough(part: SensorFit) -> bool:
     return part.redundancy >= LEAST_REDUNDANCY
 
 
 def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.Account | None) -> Chi2:
     """Of a solved problem and the residuals of its keyframes."""
-    parts: dict[str, Part] = {}
+    parts: dict[str, SensorFit] = {}
     for name, found in redundancies(solved.estimate).items():
         count, square = _squares(solved, solution.residuals, name)
         count = count or found.residuals  # of priors, which have no row among the residuals
         if name == SMART and tracks is not None:
             count -= POINT_DOF * tracks.points
         builder = builder_of(name)
-        before = parts.get(builder, Part())
+        before = parts.get(builder, SensorFit())
         parts[builder] = replace(
             before,
             residuals=before.residuals + count,
