@@ -1,4 +1,4 @@
-"""Rotations row by row: products, exponential map, skew matrices and the Jacobians of SO(3); the best rotation.
+"""Rotations row by row: products, exponential map, quaternions, the Jacobians of SO(3); the best rotation.
 
 Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III; Umeyama (1991),
 Least-squares estimation of transformation parameters between two point patterns, IEEE PAMI 13(4), for `best_rotation`.
@@ -13,15 +13,20 @@ from smartnav_graph.core.arrays import Floats
 
 
 def skew(v: Floats) -> Floats:
-    """Cross-product matrices (m, 3, 3) of vectors (m, 3)."""
+    """Cross-product matrices (m, 3, 3) of vectors (m, 3): skew(a) b = a x b."""
     zero = np.zeros(len(v))
     rows = [zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero]
     return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
 def exp(w: Floats) -> Floats:
-    """Rotation matrices (m, 3, 3) of rotation vectors (m, 3)."""
-    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) rad."""
+    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape(*w.shape, 3)
+
+
+def log(R: Floats) -> Floats:
+    """Rotation vectors (..., 3) rad, not longer than pi, of rotation matrices (..., 3, 3)."""
+    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
 
 
 def rotate(R: Floats, v: Floats) -> Floats:
@@ -29,18 +34,33 @@ def rotate(R: Floats, v: Floats) -> Floats:
     return np.asarray(np.einsum("nij,nj->ni", R, v))
 
 
+def rotate_back(R: Floats, v: Floats) -> Floats:
+    """R^T v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
+    return np.asarray(np.einsum("nji,nj->ni", R, v))
+
+
+def quaternion(R: Floats) -> Floats:
+    """Unit quaternions (m, 4) w x y z, w >= 0, of rotation matrices (m, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True)[:, [3, 0, 1, 2]])
+
+
+def from_quaternion(q: Floats) -> Floats:
+    """Rotation matrices (m, 3, 3) of quaternions (m, 4) w x y z of any norm but zero."""
+    return np.asarray(Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix())
+
+
 def left_jacobian_inverse(theta: Floats) -> Floats:
-    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) short of a half turn."""
+    """(m, 3, 3): Log(Exp(d) Exp(theta)) = theta + J d, for rotation vectors theta (m, 3) below a full turn."""
     square = (theta**2).sum(axis=1)
     angle = np.sqrt(np.maximum(square, 1e-16))
-    # (1 - angle / 2 cot(angle / 2)) / angle^2, whose series ends the division by nothing
+    # (1 - angle / 2 cot(angle / 2)) / angle^2, by its series where the angle is small
     factor = np.where(square < 1e-6, 1.0 / 12.0, (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2)
     cross = skew(theta)
     return np.asarray(np.eye(3) - 0.5 * cross + factor[:, None, None] * cross @ cross)
 
 
 def right_jacobian(theta: Floats) -> Floats:
-    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d)."""
+    """(m, 3, 3): Exp(theta + d) = Exp(theta) Exp(J d), for rotation vectors theta (m, 3)."""
     square = (theta**2).sum(axis=1)
     angle = np.sqrt(np.maximum(square, 1e-16))
     one = np.where(square < 1e-6, 0.5, (1.0 - np.cos(angle)) / angle**2)
@@ -52,7 +72,7 @@ def right_jacobian(theta: Floats) -> Floats:
 def best_rotation(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """The rotation R (3, 3) that minimises sum |y - R x|^2 over points x, y (n, 3), each minus its mean.
 
-    The singular values (3,) of sum y x^T stand beside it, the last with the sign of det: the least squares scale of
+    Also returned: the singular values (3,) of sum y x^T, the last with the sign of det; the least squares scale of
     R x is their sum over sum |x|^2. Where the second is zero, the points lie on a line and R is not determined.
     """
     u, d, vt = np.linalg.svd((y - y.mean(axis=0)).T @ (x - x.mean(axis=0)))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.so3 import best_rotation
+from smartnav_graph.core.so3 import best_rotation, from_quaternion
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
@@ -125,7 +125,7 @@ def states_of_reference(reference: Reference, offset_ns: int) -> StateSeries:
         if (norm < 1e-6).any():
             row = int(np.argmin(norm))
             raise SessionError("reference", f"qw..qz are all zero at row {row}", "unit quaternions", row=row)
-        rotation = Rotation.from_quat(reference.quat[:, [1, 2, 3, 0]]).as_matrix()
+        rotation = from_quaternion(reference.quat)
     return StateSeries(
         t_ns=reference.t_ns + offset_ns,
         position=reference.enu,

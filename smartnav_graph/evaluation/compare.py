@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.so3 import log
 from smartnav_graph.core.timebase import interpolate, seconds_since
 from smartnav_graph.evaluation.align import StateSeries, states_of_solution
 from smartnav_graph.evaluation.metrics import Statistics
@@ -148,7 +148,7 @@ def _differences(one: StateSeries, other: StateSeries) -> Floats:
     """Rotation, position and velocity (n, 9) from one series to the other."""
     assert one.rotation is not None and other.rotation is not None  # of solutions
     assert one.velocity is not None and other.velocity is not None
-    turn = Rotation.from_matrix(other.rotation @ one.rotation.transpose(0, 2, 1)).as_rotvec()
+    turn = log(other.rotation @ one.rotation.transpose(0, 2, 1))
     return np.concatenate([turn, other.position - one.position, other.velocity - one.velocity], axis=1)
 
 

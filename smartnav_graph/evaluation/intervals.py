@@ -153,7 +153,7 @@ def _noisy(truth: Reference, generated: FixesFromReference, seed: int) -> PoseFi
         raise SessionError("reference", "has no attitude", "qw, qx, qy, qz", "give --fix-sigma without degrees")
     sigma = np.radians(generated.sigma_deg)
     found = Rotation.from_rotvec(sigma * attitude) * Rotation.from_quat(truth.quat[:, [1, 2, 3, 0]])
-    quat = found.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    quat = found
     return replace(fixes, quat=quat, sigma_rot=np.full((n, 3), sigma))
 
 

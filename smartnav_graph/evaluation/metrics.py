@@ -17,9 +17,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.so3 import log
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.align import (
     FrameAlignment,
@@ -198,7 +198,7 @@ def rotation_error_deg(estimate: StateSeries, truth: StateSeries) -> Floats | No
 
 def _rotation_error(estimate: Floats, truth: Floats) -> Floats:
     """Rotation vectors (n, 3) rad, nav axes: R_ref = Exp(theta) R_est."""
-    return np.asarray(Rotation.from_matrix(truth @ estimate.transpose(0, 2, 1)).as_rotvec())
+    return log(truth @ estimate.transpose(0, 2, 1))
 
 
 def relative_error(estimate: StateSeries, truth: StateSeries, delta_s: float) -> RelativeError:

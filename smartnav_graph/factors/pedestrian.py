@@ -21,11 +21,11 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph.pass_state import PassState
@@ -140,7 +140,7 @@ class StepBuilder:
         if not part.any():
             return 0j
         rate = (window.gyro - gyro_bias) @ self.model.body_R_vehicle
-        turns = Rotation.from_rotvec(rate * window.dt[:, None]).as_matrix()
+        turns = exp(rate * window.dt[:, None])
         attitude = [R]
         for turn in turns:
             attitude.append(attitude[-1] @ turn)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, log, right_jacobian
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
@@ -86,7 +86,7 @@ class AttitudeFix:
         fix, mount = data[:, :9].reshape(-1, 3, 3), data[:, 9:18].reshape(-1, 3, 3)
         weight = 1.0 / data[:, 18:21, None]
         foretold = R @ mount @ (exp(extra[0]) if extra else np.eye(3))
-        theta = Rotation.from_matrix(foretold @ fix.transpose(0, 2, 1)).as_rotvec()
+        theta = log(foretold @ fix.transpose(0, 2, 1))
         by_turn = weight * left_jacobian_inverse(theta)
         by_state = np.zeros((len(R), 3, 9))
         by_state[:, :, :3] = by_turn @ R

@@ -18,10 +18,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian, rotate, skew
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, log, right_jacobian, rotate, skew
 from smartnav_graph.factors.observation import propagate
 from smartnav_graph.graph.states import STATES
 from smartnav_graph.graph.windows import Window
@@ -87,7 +86,7 @@ class InertialRow:
         """Data of one row, integrated at a bias (6,) and zero otherwise; covariance (9, 9) of GTSAM's preintegrated
         [rotation vector, position, velocity]."""
         turn = np.eye(9)
-        turn[:3, :3] = right_jacobian(Rotation.from_matrix(found.dR).as_rotvec()[None])[0]
+        turn[:3, :3] = right_jacobian(log(found.dR)[None])[0]
         root = np.linalg.inv(np.linalg.cholesky(turn @ covariance @ turn.T))
         base = np.concatenate([bias, np.zeros(sum(self.sizes[1:]))])
         parts = ([window.dt.sum()], found.dR, found.dp, found.dv, found.by, base, [gravity], root)
@@ -100,7 +99,7 @@ class InertialRow:
         there = propagate(pose, velocity, np.concatenate(rest, axis=1), at)
         Ri, Rj = pose[:, :3, :3], pose_j[:, :3, :3]
         back = Ri.transpose(0, 2, 1)
-        turn = Rotation.from_matrix(there.R.transpose(0, 2, 1) @ Rj).as_rotvec()
+        turn = log(there.R.transpose(0, 2, 1) @ Rj)
         dp, dv = rotate(back, pose_j[:, :3, 3] - there.p), rotate(back, velocity_j - there.v)
         m = len(pose)
         by_there = np.zeros((m, 9, 9))

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp, log, rotate
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.windows import Window
 
@@ -27,14 +27,10 @@ class Kinematics(NamedTuple):
     bias: Floats
 
 
-def _exp(vectors: Floats) -> Floats:
-    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()).reshape(*vectors.shape[:-1], 3, 3)
-
-
 def _advance(R: Floats, p: Floats, v: Floats, accel: Floats, gyro: Floats, dt: Floats, g: Floats) -> tuple[Floats, ...]:
     """One interval for many rows, as preintegration does it (see `keyframes.make_windows` on the half turn)."""
-    a = np.einsum("nij,nj->ni", R, accel) + g
-    return R @ _exp(gyro * dt[:, None]), p + v * dt[:, None] + 0.5 * a * dt[:, None] ** 2, v + a * dt[:, None]
+    a = rotate(R, accel) + g
+    return R @ exp(gyro * dt[:, None]), p + v * dt[:, None] + 0.5 * a * dt[:, None] ** 2, v + a * dt[:, None]
 
 
 def states_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
@@ -105,12 +101,12 @@ def _inside(
 ) -> Kinematics:
     there, ends = _integrated(windows, index, states, gravity, where, t_ns)
     start, length = (np.array([getattr(w, name) for w in windows]) for name in ("t0_ns", "length_s"))
-    turn = Rotation.from_matrix(ends.R.transpose(0, 2, 1) @ states.R[index]).as_rotvec()
+    turn = log(ends.R.transpose(0, 2, 1) @ states.R[index])
     dp, dv = (states.p[index] - ends.p)[where], (states.v[index] - ends.v)[where]
     T = length[where][:, None]
     x = ((t_ns - start[where]) / NS)[:, None] / T
     return Kinematics(
-        there.R @ _exp(x * turn[where]),
+        there.R @ exp(x * turn[where]),
         there.p + dp * (3 * x**2 - 2 * x**3) + dv * T * (x**3 - x**2),
         there.v + dp / T * (6 * x - 6 * x**2) + dv * (3 * x**2 - 2 * x),
         (1 - x) * states.bias[index - 1][where] + x * states.bias[index][where],

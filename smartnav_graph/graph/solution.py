@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.so3 import quaternion
 from smartnav_graph.core.timebase import seconds_since
 
 ROT, POS, VEL, ACCEL_BIAS, GYRO_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
@@ -88,7 +89,7 @@ class Solution:
     @property
     def quat_wxyz(self) -> Floats:
         """Unit quaternions (n, 4) w x y z of nav_R_body, w >= 0."""
-        return np.asarray(Rotation.from_matrix(self.nav_R_body).as_quat(canonical=True)[:, [3, 0, 1, 2]])
+        return quaternion(self.nav_R_body)
 
     @property
     def sigmas(self) -> Floats:

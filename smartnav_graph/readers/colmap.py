@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.errors import CalibrationError, SessionError
+from smartnav_graph.core.so3 import from_quaternion
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.kitti_odometry import NAV_R_CAMERA
 from smartnav_graph.readers.reference import pose_columns
@@ -90,7 +90,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
 def _nav_poses(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """nav_T_camera (n, 4, 4) of rows qw qx qy qz tx ty tz."""
     cam_T_world = np.tile(np.eye(4), (len(cam_from_world), 1, 1))
-    cam_T_world[:, :3, :3] = Rotation.from_quat(cam_from_world[:, [1, 2, 3, 0]]).as_matrix()
+    cam_T_world[:, :3, :3] = from_quaternion(cam_from_world[:, :4])
     cam_T_world[:, :3, 3] = cam_from_world[:, 4:]
     nav_T_first = np.eye(4)
     nav_T_first[:3, :3] = NAV_R_CAMERA

@@ -10,11 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
+from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import ns_from_texts
 from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
 from smartnav_graph.session.session import Device, Session
@@ -67,9 +67,8 @@ def _fix_columns(root: Path) -> Columns:
 
 def _reference_columns(folder: Path, frame: LocalFrame) -> Columns:
     ecef, velocity = (_values(folder / name, 3) for name in ("frame_positions", "frame_velocities"))
-    ecef_R_body = Rotation.from_quat(_values(folder / "frame_orientations", 4)[:, [1, 2, 3, 0]])
-    nav_R_body = Rotation.from_matrix(frame.nav_R_ecef) * ecef_R_body
-    quat = nav_R_body.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    ecef_R_body = from_quaternion(_values(folder / "frame_orientations", 4))
+    quat = quaternion(frame.nav_R_ecef @ ecef_R_body)
     columns: Columns = {"t_ns": _times(folder / "frame_times", len(ecef))}
     columns |= vector_columns("{}_m", frame.nav_from_ecef(ecef), "enu")
     columns |= dict(zip(("qw", "qx", "qy", "qz"), quat.T, strict=True))

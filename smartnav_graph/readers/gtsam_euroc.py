@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.so3 import from_quaternion
 from smartnav_graph.readers.euroc import calibrated
 from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, mount, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
@@ -110,10 +110,10 @@ def _meta(table: TextTable) -> _Meta:
 
 def _mount(meta: _Meta) -> Mount:
     t, q = np.split(
-        np.array(meta.numbers("camera extrinsics", [f"T_ci_{n}" for n in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")])),
+        np.array(meta.numbers("camera extrinsics", [f"T_ci_{n}" for n in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")])),
         [3],
     )
-    return mount(t, Rotation.from_quat(q).as_matrix())
+    return mount(t, from_quaternion(q[None])[0])
 
 
 def _camera(meta: _Meta) -> Camera:

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.files import read_table, read_toml
+from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Columns, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
@@ -191,7 +191,7 @@ def _moved(path: Path, columns: Columns, body_T_ref: Floats) -> Columns:
     if "qw" not in columns:
         raise ConfigError("--body-T-ref", f"is given, but {path} has no attitude", "qw, qx, qy, qz", "leave it out")
     poses = np.zeros((len(columns["t_ns"]), 4, 4))
-    poses[:, :3, :3] = Rotation.from_quat(_stack(columns, "qx", "qy", "qz", "qw")).as_matrix()
+    poses[:, :3, :3] = from_quaternion(_stack(columns, *QUATERNION))
     poses[:, :3, 3], poses[:, 3, 3] = _stack(columns, "e_m", "n_m", "u_m"), 1.0
     return {"t_ns": columns["t_ns"]} | _columns_of(poses @ np.linalg.inv(body_T_ref))
 
@@ -209,7 +209,7 @@ def pose_columns(path: Path, poses: Floats) -> Columns:
 
 
 def _columns_of(poses: Floats) -> Columns:
-    quat = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    quat = quaternion(poses[:, :3, :3])
     return vector_columns("{}_m", poses[:, :3, 3], "enu") | dict(zip(QUATERNION, quat.T, strict=True))
 
 

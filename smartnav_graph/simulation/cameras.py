@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp, rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Mount
@@ -119,7 +119,7 @@ class CameraModel:
     def poses(self, trajectory: Trajectory, t: Floats) -> tuple[Floats, Floats]:
         """True nav_R_cam (n, 3, 3) and nav_t_cam (n, 3) at times (n,) s."""
         body = trajectory.sample(np.clip(t, 0.0, trajectory.duration))
-        turn = Rotation.from_rotvec(np.radians(self.boresight_deg)).as_matrix()
+        turn = exp(np.radians(self.boresight_deg))
         rotation = body.nav_R_body @ np.asarray(self.mount.body_R) @ turn
         return rotation, body.nav_t_body + body.nav_R_body @ np.asarray(self.mount.body_t)
 
@@ -185,7 +185,7 @@ def view(model: CameraModel, trajectory: Trajectory, scene: Scene, t: float) -> 
     for _ in range(_ROW_PASSES if camera.readout_s > 0 else 0):
         at = begin + camera.readout_s * xy[:, 1] / (camera.height - 1)
         rotation, centres = model.poses(trajectory, at)
-        xy = camera.pixels(_flat(np.einsum("nji,nj->ni", rotation, points - centres)))
+        xy = camera.pixels(_flat(rotate_back(rotation, points - centres)))
     inside = ((xy >= 0.0) & (xy <= [camera.width - 1, camera.height - 1])).all(axis=1)
     return View(rows[inside], xy[inside])
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import LocalFrame
+from smartnav_graph.core.so3 import exp, quaternion, rotate
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix
 from smartnav_graph.simulation.trajectory import Truth
@@ -153,7 +153,7 @@ def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np
     fix = GnssFix(t_ns=t_ns, lla=frame.lla_from_nav(enu), sigma=sigma, extra=extra)
     if model.velocity_m_s > 0:
         arm = np.cross(truth.body_rate, model.body_t_antenna)
-        velocity = truth.nav_v_body + np.einsum("nij,nj->ni", truth.nav_R_body, arm)
+        velocity = truth.nav_v_body + rotate(truth.nav_R_body, arm)
         velocity = velocity + white(n, model.velocity_m_s, rng)
         fix = replace(fix, velocity=velocity, sigma_velocity=np.tile(model.velocity_m_s * AXES, (n, 1)))
     return fix
@@ -163,7 +163,7 @@ def pose_fixes(truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame
     """Pose fixes of the body at `truth` (one row a fix): the attitude is Exp(error) nav_R_body, error in nav axes."""
     n = len(t_ns)
     enu = truth.nav_t_body + model.sigma_m * rng.standard_normal((n, 3))
-    turn = Rotation.from_rotvec(model.sigma_rad * rng.standard_normal((n, 3)))
+    turn = exp(model.sigma_rad * rng.standard_normal((n, 3)))
     fix = PoseFix(
         t_ns=t_ns,
         lla=frame.lla_from_nav(enu),
@@ -172,7 +172,7 @@ def pose_fixes(truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame
         source=np.full(n, "simulation", dtype=object),
     )
     if model.sigma_rad > 0:
-        quat = (turn * Rotation.from_matrix(truth.nav_R_body)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        quat = quaternion(turn @ truth.nav_R_body)
         fix = replace(fix, quat=quat, sigma_rot=np.full((n, 3), model.sigma_rad))
     return fix
 

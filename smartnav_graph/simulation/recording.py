@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import replacing
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.core.so3 import quaternion
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
@@ -299,7 +299,7 @@ def reference(truth: Truth, t_ns: NDArray[np.int64], biases: Biases, rows: NDArr
     return Reference(
         t_ns=t_ns[rows],
         enu=truth.nav_t_body[rows],
-        quat=Rotation.from_matrix(truth.nav_R_body[rows]).as_quat(canonical=True)[:, [3, 0, 1, 2]],
+        quat=quaternion(truth.nav_R_body[rows]),
         velocity=truth.nav_v_body[rows],
         accel_bias=biases.accel[rows],
         gyro_bias=biases.gyro[rows],

@@ -16,6 +16,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.so3 import rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
 from smartnav_graph.session.streams import Barometer, Imu, Magnetometer, Velocity, WheelSpeed
@@ -88,7 +89,7 @@ def specific_force(truth: Truth, gravity: float) -> Floats:
     A device lying flat at rest reads +gravity on z.
     """
     lifted = truth.nav_a_body + np.array([0.0, 0.0, gravity])
-    return np.asarray(np.einsum("nji,nj->ni", truth.nav_R_body, lifted))
+    return rotate_back(truth.nav_R_body, lifted)
 
 
 def random_walk(t_ns: Times, start_sigma: float, walk: float, rng: np.random.Generator) -> Floats:
@@ -169,7 +170,7 @@ def magnetometer(
         angle = rng.uniform(0.0, 2 * np.pi)
         swell = size * np.sin(np.pi * np.clip((truth.t - start) / length, 0.0, 1.0)) ** 2
         iron = swell[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
-        field = field + np.einsum("nji,nj->ni", truth.nav_R_body, iron)
+        field = field + rotate_back(truth.nav_R_body, iron)
     return Magnetometer(t_ns=t_ns, field_ut=field)
 
 
@@ -202,6 +203,6 @@ def wheel(speed_m_s: Floats, t_ns: Times, model: SpeedModel, rng: np.random.Gene
 
 def velocity(truth: Truth, t_ns: Times, model: SpeedModel, rng: np.random.Generator) -> Velocity:
     """nav_R_body^T nav_v_body + white noise, m/s in body axes."""
-    body = np.einsum("nji,nj->ni", truth.nav_R_body, truth.nav_v_body)
+    body = rotate_back(truth.nav_R_body, truth.nav_v_body)
     sigma = np.full(body.shape, model.sigma_m_s)
     return Velocity(t_ns=t_ns, velocity=body + sigma * rng.standard_normal(body.shape), sigma=sigma)

@@ -26,6 +26,7 @@ from scipy.interpolate import PPoly
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import rotate, rotate_back
 
 Angle = tuple[int, Floats, Floats]
 
@@ -255,7 +256,7 @@ def chain(angles: Sequence[Angle]) -> tuple[Floats, Floats]:
     for axis, angle, angle_rate in angles:
         turn = _axis_turn(axis, angle)
         rotation = rotation @ turn
-        rate = np.einsum("nji,nj->ni", turn, rate)
+        rate = rotate_back(turn, rate)
         rate[:, axis] += angle_rate
     return np.asarray(rotation), rate
 
@@ -285,5 +286,4 @@ def _turned(psi: Floats, psi1: Floats, psi2: Floats, q: list[Floats]) -> tuple[F
     w, w1 = (np.stack([0 * r, 0 * r, r], axis=-1) for r in (psi1, psi2))
     first = q[1] + np.cross(w, q[0])
     second = q[2] + 2 * np.cross(w, q[1]) + np.cross(w1, q[0]) + np.cross(w, np.cross(w, q[0]))
-    seen = [np.einsum("nij,nj->ni", rotation, vector) for vector in (q[0], first, second)]
-    return seen[0], seen[1], seen[2]
+    return rotate(rotation, q[0]), rotate(rotation, first), rotate(rotation, second)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.progress import Progress, silent, under
+from smartnav_graph.core.so3 import rotate
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
@@ -110,7 +111,7 @@ class CameraPoses:
         """c0_R_c1 (m, 3, 3) and c0_t_c1 (m, 3) of pairs of rows."""
         back = self.nav_R_cam[first].transpose(0, 2, 1)
         apart = self.nav_t_cam[second] - self.nav_t_cam[first]
-        return back @ self.nav_R_cam[second], np.einsum("nij,nj->ni", back, apart)
+        return back @ self.nav_R_cam[second], rotate(back, apart)
 
 
 def _poses(reference: Reference, t_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -132,7 +133,7 @@ def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) 
     weak = np.linalg.norm(t, axis=1) * focal_px / DEPTH_M < TOLERANCE_PX
     safe = np.where(weak[:, None], [0.0, 0.0, 1.0], t)
     epipolar = np.abs(sampson(R, safe, x0[:, None], x1[:, None]).residual[:, 0])
-    ahead = np.einsum("nij,nj->ni", R, rays(x1))
+    ahead = rotate(R, rays(x1))
     moved = ahead[:, :2] / np.where(np.abs(ahead[:, 2:]) > 1e-9, ahead[:, 2:], np.nan)
     turned = np.linalg.norm(moved - x0, axis=1)
     return np.where(weak, turned, epipolar) * focal_px <= TOLERANCE_PX, weak

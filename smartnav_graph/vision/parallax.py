@@ -6,9 +6,9 @@ Source: Hartley, Zisserman (2004), Multiple View Geometry, 9.6.2 (the four poses
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp
 from smartnav_graph.vision.epipolar import cross, rays
 from smartnav_graph.vision.refine import Matched, angle
 
@@ -42,7 +42,7 @@ def faced(matched: Matched, R: Floats, t: Floats, *, known_rotation: bool) -> tu
     Where two do alike the smaller rotation is taken: without parallax the twin, half a turn round the baseline, cannot
     be told by the matches. A rotation known beforehand has no twin.
     """
-    twin = np.asarray(Rotation.from_rotvec(np.pi * t).as_matrix() @ R)
+    twin = exp(np.pi * t) @ R
     turns = [R] if known_rotation else [R, twin]
     poses = [(turn, side * t) for turn in turns for side in (1.0, -1.0)]
     votes = [float(in_front(matched, *pose).sum()) for pose in poses]

@@ -21,10 +21,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.so3 import exp, log
 from smartnav_graph.vision.epipolar import cross, rays, sampson
 
 State = tuple[Floats, ...]
@@ -95,13 +95,8 @@ def rotation_vector(R: Floats) -> Floats:
     twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = 0.5 * math.sqrt(float(twice @ twice)), 0.5 * (float(np.trace(R)) - 1.0)
     if cosine < -0.99:
-        return np.asarray(Rotation.from_matrix(R).as_rotvec())
+        return log(R)
     return 0.5 * twice * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
-
-
-def turned(R: Floats, w: Floats) -> Floats:
-    """R Exp(w)."""
-    return np.asarray(R @ Rotation.from_rotvec(w).as_matrix())
 
 
 def shifted(t: Floats, d: Floats) -> Floats:
@@ -123,7 +118,7 @@ class Epipolar:
         return (r / self.matched.sigma)[:, None], (by_state / self.matched.sigma[:, None])[:, None]
 
     def moved(self, state: State, step: Floats) -> State:
-        return turned(state[0], step[:3]), shifted(state[1], step[3:5])
+        return state[0] @ exp(step[:3]), shifted(state[1], step[3:5])
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class Turn:
         return r, by_y @ _by_turn(R, rays(self.matched.xy1))
 
     def moved(self, state: State, step: Floats) -> State:
-        return (turned(state[0], step),)
+        return (state[0] @ exp(step),)
 
 
 @dataclass(frozen=True)
@@ -156,7 +151,7 @@ class Plane:
         return r, by_y @ np.concatenate([_by_turn(R, b), by_direction, by_plane], axis=2)
 
     def moved(self, state: State, step: Floats) -> State:
-        return turned(state[0], step[:3]), shifted(state[1], step[3:5]), state[2] + step[5:]
+        return state[0] @ exp(step[:3]), shifted(state[1], step[3:5]), state[2] + step[5:]
 
 
 def transfer(H: Floats, matched: Matched) -> tuple[Floats, Floats]:

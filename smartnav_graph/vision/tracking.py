@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.streams import Imu
@@ -47,7 +47,7 @@ class Gyro:
         """Integrate the body rate, the mean of two samples between them."""
         dt = np.diff(imu.t_ns) / NS
         turns = np.tile(np.eye(3), (len(imu), 1, 1))
-        turns[1:] = Rotation.from_rotvec(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * dt[:, None]).as_matrix()
+        turns[1:] = exp(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * dt[:, None])
         step = 1
         while step < len(turns):  # running products by doubling
             turns[step:] = turns[:-step] @ turns[step:]
@@ -63,7 +63,7 @@ class Gyro:
         if not self.t_ns[0] <= t_ns <= self.t_ns[-1]:
             return None
         row = int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
-        rest = Rotation.from_rotvec(self.rate[row] * (t_ns - self.t_ns[row]) / NS).as_matrix()
+        rest = exp(self.rate[row] * (t_ns - self.t_ns[row]) / NS)
         return np.asarray(self.start_R_body[row] @ rest)
 
 

@@ -23,9 +23,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import exp
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, State, rotation_vector, shifted, tangent_basis
 
@@ -110,7 +110,7 @@ def _around(found: Floats, matched: Matched, fit: Fit, prior: RotationPrior | No
     spread, axes = np.linalg.eigh(found)
     points = (np.sqrt(UNKNOWNS * np.maximum(spread, 0.0)) * axes).T
     steps = np.concatenate([points, -points])
-    turns = R @ Rotation.from_rotvec(steps[:, :3]).as_matrix()
+    turns = R @ exp(steps[:, :3])
     ways = np.stack([shifted(t, step[3:]) for step in steps])
     _, by_turn, by_t = sampson(turns, ways, matched.xy0, matched.xy1)
     across = np.stack([tangent_basis(way) for way in ways])

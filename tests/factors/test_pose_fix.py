@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.core.so3 import exp, left_jacobian_inverse, right_jacobian
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.replay import replay
@@ -70,16 +69,6 @@ def test_derivatives_of_an_attitude(extra):
     states = [rng.uniform(-1.0, 1.0, (m, 3)) for _ in extra]
     zeros = np.zeros((m, 3))
     assert_observation(AttitudeFix(extra), random_rotations(rng, m), zeros, zeros, states, data)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-5, 1e-3, 1.0, 3.0])
-def test_jacobians_of_the_rotation_group(size):
-    theta = size * np.array([[2.0, -1.0, 2.0]]) / 3.0
-    d = np.array([[1.0, 2.0, -3.0]]) * 1e-6
-    log = Rotation.from_matrix(exp(d) @ exp(theta)).as_rotvec()
-    np.testing.assert_allclose(log - theta, d @ left_jacobian_inverse(theta)[0].T, atol=1e-10)
-    right = Rotation.from_matrix(exp(theta).transpose(0, 2, 1) @ exp(theta + d)).as_rotvec()
-    np.testing.assert_allclose(right, d @ right_jacobian(theta)[0].T, atol=1e-10)
 
 
 def test_mount_lever_arm_and_clock_are_found(made):

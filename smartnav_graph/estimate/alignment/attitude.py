@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.so3 import exp, left_jacobian_inverse
+from smartnav_graph.core.so3 import exp, left_jacobian_inverse, log
 from smartnav_graph.core.timebase import seconds_since
 from smartnav_graph.graph.robust import loss_weights
 from smartnav_graph.session.streams import Imu
@@ -60,7 +59,7 @@ def _refined(
 ) -> tuple[Floats, Floats]:
     """One robust Gauss-Newton step of R_0 (3, 3) and b (3,) for attitudes `seen` (m, 3, 3)."""
     D, J = rotate
-    theta = Rotation.from_matrix((R @ D) @ seen.transpose(0, 2, 1)).as_rotvec()
+    theta = log((R @ D) @ seen.transpose(0, 2, 1))
     left = left_jacobian_inverse(theta)
     by = np.concatenate([left, left @ R @ D @ J], axis=2) / SLACK  # R_0 <- Exp(w) R_0
     root = np.sqrt(loss_weights((theta**2).sum(axis=1) / SLACK**2, "huber")[0])[:, None]

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.so3 import skew
+from smartnav_graph.core.so3 import exp, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.alignment.static import inertial_motion
 from smartnav_graph.graph import gnc
@@ -168,7 +167,7 @@ class AlignmentProblem:
         normal, gradient, before = A.T @ A, A.T @ b, self._cost(state, weight)
         for damping in DAMPING:
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + LEAST_CURVATURE), gradient)
-            R = Rotation.from_rotvec(step[:3]).as_matrix() @ state.R
+            R = exp(step[:3]) @ state.R
             new = self._judged(Alignment(R, state.p + step[3:6], state.v + step[6:9], state.found + step[9:], self.t))
             if self._cost(new, weight) <= before:
                 return new

@@ -168,7 +168,7 @@ def _walk(
     c, bias, misfit = found
     at = track.keyframe
     turn = np.angle(c) - bias * track.t[at]
-    about_up = Rotation.from_rotvec(np.outer(turn, [0.0, 0.0, 1.0])).as_matrix()
+    about_up = exp(np.outer(turn, [0.0, 0.0, 1.0]))
     R = about_up @ track.R[at]
     p = np.column_stack([place.real[at], place.imag[at], height[at]])
     around = [np.interp(track.t[at] + s, track.t, part) for part in (place.real, place.imag) for s in (0.5, -0.5)]

@@ -28,6 +28,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.progress import Progress, silent, watched
+from smartnav_graph.core.so3 import exp, rotate
 from smartnav_graph.core.timebase import interpolate, ns_from_seconds, seconds_since
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.graph.solution import POS, Solution
@@ -155,8 +156,8 @@ def places(
     mounts = [session.mount(picture.camera) for picture in taken]
     arms, turns = np.array([m.body_t for m in mounts]), np.array([m.body_R for m in mounts])
     main = np.array([picture.camera == camera_name(session, session.calibration) for picture in taken])
-    turns = turns @ Rotation.from_rotvec(main[:, None] * boresight).as_matrix()
-    at = p + np.einsum("nij,nj->ni", R, arms)
+    turns = turns @ exp(main[:, None] * boresight)
+    at = p + rotate(R, arms)
     axis = (R @ turns)[:, :, 2]
     lla, variance = frame.lla_from_nav(at), interpolate(t_ns, solution.t_ns, solution.sigmas[:, POS] ** 2)
     direction = _azimuths(frame, at, axis)
