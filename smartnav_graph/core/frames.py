@@ -118,12 +118,6 @@ def magnetic_field_ut(origin: Origin, year: float) -> Floats:
     return np.array([field.y, field.x, -field.z]) / 1000.0
 
 
-def declination_deg(origin: Origin, year: float) -> float:
-    """Magnetic declination (deg, positive where the needle points east of north) at a decimal year."""
-    east, north, _ = magnetic_field_ut(origin, year)
-    return float(np.degrees(np.arctan2(east, north)))
-
-
 def axis_vector(name: str) -> Floats:
     """Unit vector (3,) of a signed body axis such as ``+y`` or ``-z``.
 
@@ -170,8 +164,3 @@ def nav_R_body_from_heading(heading_deg: float, body_up: ArrayLike, forward: str
     a = np.radians(90.0 - heading_deg)
     nav_R_level = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(nav_R_level @ body_R_level.T)
-
-
-def wrap_deg(angle: ArrayLike) -> Floats:
-    """Angles in degrees wrapped to [-180, 180)."""
-    return (np.asarray(angle, dtype=np.float64) + 180.0) % 360.0 - 180.0

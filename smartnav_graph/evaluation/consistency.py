@@ -41,13 +41,3 @@ def chi2_bounds(dof: int, probability: float = 0.95) -> tuple[float, float]:
     tail = 0.5 * (1.0 - probability)
     # chi-square quantile as a gamma quantile: scipy.stats takes half a second to import
     return 2.0 * float(gammaincinv(0.5 * dof, tail)), 2.0 * float(gammaincinv(0.5 * dof, 1.0 - tail))
-
-
-def average_nees_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[float, float]:
-    """Two-sided interval for the mean of `samples` independent NEES values of `dof` degrees of freedom.
-
-    samples * mean ~ chi2(samples * dof). Successive epochs of one smoothed trajectory are not independent:
-    the bounds hold across runs, and are too narrow along one run.
-    """
-    low, high = chi2_bounds(dof * samples, probability)
-    return low / samples, high / samples

@@ -220,7 +220,7 @@ def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:
         made["magnetometer"] = sensors.magnetometer(
             ride.truth.take(rows),
             ride.t_ns[rows],
-            magnetic_field_ut(),
+            frames.magnetic_field_ut(ORIGIN, YEAR),
             rng,
             hard_iron_sigma_ut=mag.hard_iron_sigma_ut,
             sigma_ut=mag.sigma_ut,
@@ -267,11 +267,6 @@ def _calibration(scenario: Scenario) -> Calibration:
     if (camera := scenario.camera) is not None:
         made = replace(made, cameras={camera.name: camera.camera})
     return made
-
-
-def magnetic_field_ut() -> NDArray[np.float64]:
-    """World Magnetic Model at the scenarios' origin and date, (3,) uT in ENU."""
-    return frames.magnetic_field_ut(ORIGIN, YEAR)
 
 
 def _within(trajectory: Trajectory, end: float) -> list[tuple[float, float]]:

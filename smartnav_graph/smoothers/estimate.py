@@ -152,11 +152,6 @@ def values_of(indices: Sequence[int], R: Floats, p: Floats, v: Floats, bias: Flo
     return values
 
 
-def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
-    """Largest distance m and rotation angle deg over the keyframes of two estimates of the same problem."""
-    return distance(one.states(), other.states())
-
-
 def distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, float]:
     """Largest distance m and rotation angle deg between keyframe states (see `Estimate.states`)."""
     Ra, pa, Rb, pb = *one[:2], *other[:2]

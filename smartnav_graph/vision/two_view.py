@@ -22,7 +22,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.vision.parallax import CLEAR, faced, in_front, parallax
+from smartnav_graph.vision.parallax import CLEAR, faced, in_front
 from smartnav_graph.vision.planar import CLEARLY_BETTER, PlanarFit, fit_plane
 from smartnav_graph.vision.ransac import LEAST, OPTICAL_AXIS, Pose, colmap, directions, magsac, turns
 from smartnav_graph.vision.refine import (
@@ -79,7 +79,6 @@ class TwoView:
         second moment of both. That of a rotation holds if there is no baseline: one too short to show would turn it
     inliers (m,) : matches the geometry explains
     chi2_per_dof : of the inliers, and of the prior where there is one; NaN if failed
-    parallax_rad : median angle between the inliers' rays once the rotation is taken out; NaN if failed
     """
 
     kind: Kind
@@ -89,7 +88,6 @@ class TwoView:
     covariance: Floats
     inliers: Mask
     chi2_per_dof: float
-    parallax_rad: float
 
 
 def two_view(
@@ -256,8 +254,7 @@ def _told(kind: Kind, reason: str, matched: Matched, state: State, prior: Rotati
     R, t = fit.state[0], fit.state[1] if len(fit.state) > 1 else np.zeros(3)
     freedom = fit.residual.size + (0 if prior is None else 3) - len(fit.information)
     chi2 = float(fit.square.sum()) + _deviation(R, prior)
-    angle = float(np.median(parallax(matched.only(inliers), R)))
-    return TwoView(kind, reason, R, t, spread, inliers, chi2 / freedom, angle)
+    return TwoView(kind, reason, R, t, spread, inliers, chi2 / freedom)
 
 
 def _refused(kind: Kind, matched: Matched, agree: int, fit: Fit | None, prior: RotationPrior | None) -> str:
@@ -310,4 +307,4 @@ def _unchecked(fit: Fit) -> Mask:
 
 def _failed(m: int, reason: str) -> TwoView:
     unknown = np.diag(np.full(5, np.inf))
-    return TwoView("failed", reason, np.eye(3), np.zeros(3), unknown, np.zeros(m, dtype=bool), np.nan, np.nan)
+    return TwoView("failed", reason, np.eye(3), np.zeros(3), unknown, np.zeros(m, dtype=bool), np.nan)

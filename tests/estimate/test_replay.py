@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import largest_difference
 from sessions import positions, recorded, shifted, turned_deg, with_gnss, with_imu
 
 import smartnav_graph as sn
@@ -17,7 +18,6 @@ from smartnav_graph.graph.update import build_update
 from smartnav_graph.output.run_folder import read_run, write_run
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.batch import Batch
-from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
 

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import average_nees_bounds
 
-from smartnav_graph.evaluation.consistency import average_nees_bounds, chi2_bounds, nees
+from smartnav_graph.evaluation.consistency import chi2_bounds, nees
 
 
 def test_nees_is_the_squared_error_over_the_variance():

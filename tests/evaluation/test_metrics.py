@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from differences import average_nees_bounds
 from planted_run import make_reference, make_solution
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.evaluation import Statistics, evaluate
-from smartnav_graph.evaluation.consistency import average_nees_bounds
 
 
 def noisy(seconds, rng, sigma_m=0.3, sigma_rad=0.05):

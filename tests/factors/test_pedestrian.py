@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from differences import wrap_deg
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
@@ -37,7 +38,7 @@ def test_yaw_of_a_device_that_is_only_pitched_is_its_heading(heading, pitch):
     level = frames.nav_R_body_from_heading(heading, [0.0, 0.0, 1.0])
     tilted = level @ Rotation.from_euler("x", pitch, degrees=True).as_matrix()
     yaw = np.degrees(level_yaw((tilted @ PHONE)[None]))[0]
-    assert frames.wrap_deg(90.0 - heading - yaw) == pytest.approx(0.0, abs=1e-9)
+    assert wrap_deg(90.0 - heading - yaw) == pytest.approx(0.0, abs=1e-9)
 
 
 def states(rng, m: int) -> list[np.ndarray]:

@@ -49,6 +49,13 @@ def test_the_date_of_a_clock(epoch, second, year):
     np.testing.assert_allclose(session.magnetic_field_ut, frames.magnetic_field_ut(ORIGIN, year), atol=1e-3)  # uT
 
 
+def test_declination_is_that_of_the_published_test_values():
+    # WMM2025 test values (NOAA): 2025.0, height 0 km; 80 N 0 E: D = 1.28 deg; 0 N 120 E: D = -0.16 deg
+    assert Session(origin=Origin(80.0, 0.0, 0.0)).declination_deg == pytest.approx(1.28, abs=0.01)
+    assert Session(origin=Origin(0.0, 120.0, 0.0)).declination_deg == pytest.approx(-0.16, abs=0.01)
+    assert Session().declination_deg == 0.0
+
+
 def test_positions_in_local_metres():
     whole = Session(origin=ORIGIN)
     local, geodetic = example(GnssFix), example(GnssFix, geodetic=True)

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.frames import magnetic_field_ut
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session import folder as session_folder
-from smartnav_graph.simulation.recording import magnetic_field_ut
+from smartnav_graph.simulation.recording import ORIGIN, YEAR
 from smartnav_graph.simulation.scenarios import SCENARIOS, simulate
 
 # Force m/s^2, height m, field uT and pressure hPa of the first samples of walk-60s, seed 3.
@@ -80,7 +81,7 @@ def test_gravity_is_normal_gravity_at_the_origin(sessions):
 
 
 def test_the_magnetic_field_is_that_of_middle_europe():
-    e, n, u = magnetic_field_ut()
+    e, n, u = magnetic_field_ut(ORIGIN, YEAR)
     assert np.hypot(np.hypot(e, n), u) == pytest.approx(49.7, abs=0.5)  # uT
     assert np.degrees(np.arctan2(e, n)) == pytest.approx(4.6, abs=0.7)  # deg east
     assert np.degrees(np.arctan2(-u, np.hypot(e, n))) == pytest.approx(67.3, abs=0.5)  # deg down

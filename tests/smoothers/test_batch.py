@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from differences import largest_difference
 from exact import record
 
 from smartnav_graph.core.errors import ConfigError, SolverError
@@ -15,7 +16,6 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import build_update
 from smartnav_graph.smoothers.batch import Batch, BatchConfig, check_covariance
-from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.minimise import SolveConfig
 
 FINE = SolveConfig(max_iterations=100, tolerance=1e-13, step_tolerance=1e-8)

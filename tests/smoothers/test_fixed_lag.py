@@ -8,6 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from differences import largest_difference
 from exact import record
 
 from smartnav_graph.core.errors import SolverError
@@ -23,7 +24,6 @@ from smartnav_graph.graph.update import FactorBatch, build_update
 from smartnav_graph.simulation import motions
 from smartnav_graph.smoothers import fixed_lag, incremental
 from smartnav_graph.smoothers.batch import Batch
-from smartnav_graph.smoothers.estimate import largest_difference
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from differences import wrap_deg
 
 import smartnav_graph as sn
-from smartnav_graph.core.frames import wrap_deg
 from smartnav_graph.estimate.config import GapConfig
 from smartnav_graph.evaluation.metrics import _rotation_error as rotation_error_deg
 from smartnav_graph.session.streams import GnssFix

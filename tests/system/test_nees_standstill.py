@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import average_nees_bounds
 from sessions import on_control, recorded
 from test_nees import PARTS, average_nees
 
-from smartnav_graph.evaluation.consistency import average_nees_bounds
 from smartnav_graph.session.session import Session
 from smartnav_graph.simulation.trajectory import Leg, Legs, Sway, Trajectory
 

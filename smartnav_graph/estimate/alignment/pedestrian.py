@@ -40,14 +40,13 @@ COARSE_BIASES = 41  # values of b tried within three sigma
 @dataclass(frozen=True)
 class Walk:
     """First sight of every keyframe: attitude R (n, 3, 3), position p (n, 3) m, velocity v (n, 3) m/s in nav, gyro_bias
-    (n, 3) rad/s; misfit m, rms of the fixes."""
+    (n, 3) rad/s."""
 
     windows: Sequence[Window]
     R: Floats
     p: Floats
     v: Floats
     gyro_bias: Floats
-    misfit: float
 
     def state(self, row: int = 0) -> State:
         """One keyframe."""
@@ -165,7 +164,7 @@ def _level(windows: Sequence[Window]) -> Floats:
 def _walk(
     windows: Sequence[Window], track: _Track, place: Complexes, height: Floats, found: tuple[complex, float, float]
 ) -> Walk:
-    c, bias, misfit = found
+    c, bias, _ = found
     at = track.keyframe
     turn = np.angle(c) - bias * track.t[at]
     about_up = exp(np.outer(turn, [0.0, 0.0, 1.0]))
@@ -173,4 +172,4 @@ def _walk(
     p = np.column_stack([place.real[at], place.imag[at], height[at]])
     around = [np.interp(track.t[at] + s, track.t, part) for part in (place.real, place.imag) for s in (0.5, -0.5)]
     v = np.column_stack([around[0] - around[1], around[2] - around[3], np.zeros(len(at))])
-    return Walk(windows, R, p, v, bias * R[:, 2, :], misfit)
+    return Walk(windows, R, p, v, bias * R[:, 2, :])

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.estimate.problem import Problem
-from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, indices_of, letters_of
@@ -58,7 +57,6 @@ class ImagePairs:
     """Image pairs of one camera and what became of them: `use` (m,) of the matches, `verdict` (n,) of the pairs, places
     in `factors.coplanarity.REASONS`."""
 
-    camera: str
     pairs: Pairs
     use: NDArray[np.bool_]
     verdict: NDArray[np.intp]
@@ -70,7 +68,7 @@ class ImagePairs:
         if builder is None:
             return None
         use, verdict = builder.used_matches(pass_state), builder.verdict_of(pass_state)
-        return cls(camera_name(problem.session, problem.calibration), builder.seen, use, verdict)
+        return cls(builder.seen, use, verdict)
 
 
 @dataclass(frozen=True)

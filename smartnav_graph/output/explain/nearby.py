@@ -23,10 +23,6 @@ class Stretch:
     away_s: float
     kind: str
 
-    @property
-    def end_s(self) -> float:
-        return self.start_s + self.length_s
-
 
 @dataclass(frozen=True)
 class Around:

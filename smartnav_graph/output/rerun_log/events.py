@@ -25,7 +25,6 @@ class Events:
     use : by stream, (n,) USED, REJECTED, or WITHHELD (it has no residual: kept back, or outside the solution).
     """
 
-    t0_ns: int
     start_ns: int
     end_ns: int
     gaps: list[Gap]
@@ -40,7 +39,6 @@ def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]
     use = {name: fix_use(stream, solution) for name, stream in session.absolute().items()}
     fixes = session.gnss.t_ns[use["gnss"] == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
     return Events(
-        t0_ns=session.t0_ns,
         start_ns=start,
         end_ns=end,
         gaps=imu_gaps(session, summary),

@@ -24,7 +24,7 @@ def image_pairs(session: Session, trace_pairs: ImagePairs | None) -> ImagePairs 
         return trace_pairs
     pairs = of_matches(session.matches)
     everything = np.ones(len(pairs.pair), dtype=bool)
-    return ImagePairs("", pairs, everything, np.full(len(pairs), UNJUDGED, dtype=np.intp))
+    return ImagePairs(pairs, everything, np.full(len(pairs), UNJUDGED, dtype=np.intp))
 
 
 def shown(seen: ImagePairs) -> NDArray[np.intp]:

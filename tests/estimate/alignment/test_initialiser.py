@@ -8,12 +8,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from differences import wrap_deg
 from exact import GRAVITY, START_NS, angle_deg, eight, record
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.errors import ConfigError, SolverError
+from smartnav_graph.core.frames import magnetic_field_ut
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.estimate.alignment.initialiser import (
     InitialiseConfig,
@@ -31,7 +33,7 @@ from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.session.streams import Imu, Magnetometer
 from smartnav_graph.simulation import motions, sensors
-from smartnav_graph.simulation.recording import magnetic_field_ut
+from smartnav_graph.simulation.recording import ORIGIN, YEAR
 from smartnav_graph.simulation.scenarios import simulate
 from smartnav_graph.simulation.sensors import PROFILES
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
@@ -249,7 +251,7 @@ def no_solver(prior, count, pass_state):
 
 
 def declination_deg() -> float:
-    east, north, _ = magnetic_field_ut()
+    east, north, _ = magnetic_field_ut(ORIGIN, YEAR)
     return float(np.degrees(np.arctan2(east, north)))
 
 
@@ -259,12 +261,16 @@ def test_a_rest_of_a_calibrated_device_gives_the_magnetic_heading_within_three_d
     recording = record(motions.static(30.0), noise=replace(PHONE, accel_bias_sigma=0.02), seed=seed)
     t_ns = recording.session.imu.t_ns[::10]
     mag = sensors.magnetometer(
-        recording.truth(t_ns), t_ns, magnetic_field_ut(), np.random.default_rng(seed), hard_iron_sigma_ut=0.3
+        recording.truth(t_ns),
+        t_ns,
+        magnetic_field_ut(ORIGIN, YEAR),
+        np.random.default_rng(seed),
+        hard_iron_sigma_ut=0.3,
     )
     session = recording.session.replace(magnetometer=mag)
     start = initialiser(session, declination_deg=declination_deg()).run(no_solver, None)
     assert start.method == "static" and "magnetometer" in start.sentence
-    assert abs(frames.wrap_deg(start.heading_deg - 40.0)) < 3.0
+    assert abs(wrap_deg(start.heading_deg - 40.0)) < 3.0
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -272,7 +278,7 @@ def test_a_rest_of_a_phone_as_it_is_keeps_the_sigma_it_claims(seed):
     session = simulate("static-60s", seed)  # heading 40 deg, pitch 5 deg, roll -3 deg
     start = initialiser(session, declination_deg=declination_deg(), iron_sigma=1.0).run(no_solver, None)
     # 20 deg for iron nearby and 1 uT of the phone's own in 19 uT
-    assert abs(frames.wrap_deg(start.heading_deg - 40.0)) < start.sigma_heading_deg == pytest.approx(20.3, abs=0.3)
+    assert abs(wrap_deg(start.heading_deg - 40.0)) < start.sigma_heading_deg == pytest.approx(20.3, abs=0.3)
     R = start.prior.start.nav.attitude().matrix()
     true = motions.static(1.0).sample([0.5]).nav_R_body[0]
     tilt = np.degrees(np.arccos(np.clip((R @ true.T)[2, 2], -1, 1)))
@@ -288,12 +294,12 @@ def test_the_magnetic_heading_of_an_exact_field(heading, roll, pitch):
     n = 1000
     t = START_NS + ns_from_seconds(np.arange(n) / 100)
     imu = Imu(t_ns=t, accel=np.tile(R.T @ [0, 0, GRAVITY], (n, 1)), gyro=np.zeros((n, 3)))
-    mag = Magnetometer(t_ns=t, field_ut=np.tile(R.T @ magnetic_field_ut(), (n, 1)))
+    mag = Magnetometer(t_ns=t, field_ut=np.tile(R.T @ magnetic_field_ut(ORIGIN, YEAR), (n, 1)))
     session = record().session.replace(imu=imu, magnetometer=mag, gnss=None, control=None)
     at = START_NS + ns_from_seconds(np.arange(0.0, 9.0))
     windows = make_windows(imu, at, [], {}, KeyframeConfig(max_spacing_s=2.0))
     start = initialiser(session, windows=windows, declination_deg=declination_deg()).run(no_solver, None)
-    assert abs(frames.wrap_deg(start.heading_deg - heading)) < 1e-6
+    assert abs(wrap_deg(start.heading_deg - heading)) < 1e-6
     assert angle_deg(start.prior.start.nav.attitude().matrix(), R) < 1e-6
 
 
@@ -353,7 +359,7 @@ def test_a_start_from_good_fixes_finds_attitude_and_speed(name, method):
     truth = recording.truth([problem.windows[0].t1_ns])
     nav = start.prior.start.nav
     heading = frames.heading_pitch_roll_deg(truth.nav_R_body)[0, 0]
-    error = abs(float(frames.wrap_deg(start.heading_deg - heading)))
+    error = abs(float(wrap_deg(start.heading_deg - heading)))
     assert start.method == method
     assert error < 3.0 * start.sigma_heading_deg and start.sigma_heading_deg < 10.0
     assert np.linalg.norm(nav.velocity() - truth.nav_v_body[0]) < 0.5

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import wrap_deg
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
 from smartnav_graph.core import frames
-from smartnav_graph.core.frames import body_R_vehicle, wrap_deg
+from smartnav_graph.core.frames import body_R_vehicle
 from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.estimate.alignment.pedestrian import Walk, walked
 from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows

@@ -46,7 +46,7 @@ def seen_session(**changes):
 def trace_of(verdict=VERDICT):
     from recordings import NO_WIRING
 
-    return Diagnostics(make_solution().t_ns, NO_WIRING, pairs=ImagePairs("cam0", PAIRS, USE, verdict))
+    return Diagnostics(make_solution().t_ns, NO_WIRING, pairs=ImagePairs(PAIRS, USE, verdict))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_camera_sits_on_the_body_and_sees_as_calibrated(found):
 
 def test_of_pairs_of_one_image_the_shortest_in_use_is_shown():
     def shown(*verdict):
-        return pairs.shown(ImagePairs("cam0", PAIRS, USE, np.array(verdict))).tolist()
+        return pairs.shown(ImagePairs(PAIRS, USE, np.array(verdict))).tolist()
 
     assert shown(IN_USE, IN_USE, IN_USE, IN_USE, IN_USE) == [0, 2, 3, 4]
     assert shown(IN_USE, IN_USE, CONTRARY, IN_USE, IN_USE) == [0, 1, 3, 4]
