@@ -19,11 +19,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.progress import Progress, silent, under
+from smartnav_graph.core.so3 import exp, from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.replay import replay
@@ -152,8 +152,7 @@ def _noisy(truth: Reference, generated: FixesFromReference, seed: int) -> PoseFi
     if truth.quat is None:
         raise SessionError("reference", "has no attitude", "qw, qx, qy, qz", "give --fix-sigma without degrees")
     sigma = np.radians(generated.sigma_deg)
-    found = Rotation.from_rotvec(sigma * attitude) * Rotation.from_quat(truth.quat[:, [1, 2, 3, 0]])
-    quat = found
+    quat = quaternion(exp(sigma * attitude) @ from_quaternion(truth.quat))
     return replace(fixes, quat=quat, sigma_rot=np.full((n, 3), sigma))
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.so3 import log
+from smartnav_graph.core.so3 import log, rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.align import (
     FrameAlignment,
@@ -210,7 +210,7 @@ def relative_error(estimate: StateSeries, truth: StateSeries, delta_s: float) ->
     if estimate.rotation is None or truth.rotation is None:
         return RelativeError(delta_s, _rms(motion - expected), None, len(i))
     R, Q = estimate.rotation, truth.rotation
-    difference = np.einsum("nji,nj->ni", R[i], motion) - np.einsum("nji,nj->ni", Q[i], expected)
+    difference = rotate_back(R[i], motion) - rotate_back(Q[i], expected)
     turn = _rotation_error(R[i].transpose(0, 2, 1) @ R[j], Q[i].transpose(0, 2, 1) @ Q[j])
     return RelativeError(delta_s, _rms(difference), float(np.degrees(_rms(turn))), len(i))
 
