@@ -101,7 +101,7 @@ def test_what_is_near():
         np.array(["gnss", "gnss", "imu"], dtype=object), stamps.astype(np.int64), *[np.zeros((3, 1))] * 3
     )
     found = nearby(run, rows, 5.0)
-    assert (found.gap.start_s, found.gap.away_s, found.gap.end_s) == (1.0, -2.0, 3.0)
+    assert (found.gap.start_s, found.gap.away_s, found.gap.length_s) == (1.0, -2.0, 2.0)
     assert (found.standstill.start_s, found.standstill.away_s) == (0.0, -1.0)
     assert (found.rejection["sensor"], found.rejection["away_s"]) == ("gnss", -2.0)
     assert set(found.used) == {"gnss"}
