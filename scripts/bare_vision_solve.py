@@ -52,7 +52,7 @@ def solve(folder: str) -> dict[str, float]:
             pairs += 1
     values = gtsam.Values(start)
     for builder in problem.builders:
-        for state in builder.camera_model.states().values() if builder.name == "coplanarity" else ():
+        for state in builder.camera_model.states().values() if builder.name == "image_pairs" else ():
             graph.push_back(session_prior(state))
             values.insert(state.key, state.initial)
     ours = vectorised(found, values)

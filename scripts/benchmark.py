@@ -111,7 +111,7 @@ def measure(kind: str, path: str) -> None:
     alone = 0.0
     if kind == "vision":  # the same keyframes without images
         spacing = replace(config.keyframes, max_spacing_s=IMAGE_PERIOD_S)
-        without = replace(config, coplanarity=replace(config.coplanarity, enabled=False), keyframes=spacing)
+        without = replace(config, image_pairs=replace(config.image_pairs, enabled=False), keyframes=spacing)
         begin = time.process_time()
         smooth(session, without)
         alone = time.process_time() - begin

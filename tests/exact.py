@@ -16,7 +16,7 @@ import numpy as np
 
 from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors import BUILDERS, FactorContext
+from smartnav_graph.factors import FactorContext, make_builders
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.graph.interpolate import Kinematics
 from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
@@ -144,8 +144,7 @@ def assemble(
     windows = make_windows(imu, times, gaps, aiding, keyframes)
     calibration, config = session.calibration or Calibration(), Config(gnss=GnssConfig(loss="none"))
     context = FactorContext(session, calibration, gaps, session.device.vehicle, config)
-    made = {name: make(context) for name, make in BUILDERS.items()}
-    builders = {name: builder for name, builder in made.items() if builder is not None}
+    builders = {builder.name: builder for builder in make_builders(context)}
     there, biases = truth(times), bias(times)
     states = [state(there, k, int(t), biases[k]) for k, t in enumerate(times)]
     steps = [

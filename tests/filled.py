@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from smartnav_graph.session.streams import Positioned, Stream
+from smartnav_graph.session.stream import Positioned, Stream
 
 
 def example(kind: type[Stream], n: int = 6, *, optional: bool = True, geodetic: bool = False) -> Stream:

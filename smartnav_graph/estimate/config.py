@@ -1,4 +1,4 @@
-"""The rooms' options in one frozen tree, <-> TOML. Noise of a device does not live here but in calibration.toml."""
+"""All options in one frozen tree, <-> TOML. Noise of a device is not here but in calibration.toml."""
 
 from __future__ import annotations
 
@@ -13,22 +13,8 @@ import tomli_w
 from smartnav_graph.core.errors import ConfigError, SmartnavError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig
-from smartnav_graph.factors.barometer import BarometerConfig
-from smartnav_graph.factors.control import ControlConfig
-from smartnav_graph.factors.coplanarity import CoplanarityConfig
-from smartnav_graph.factors.gnss import GnssConfig
-from smartnav_graph.factors.gravity import GravityConfig
-from smartnav_graph.factors.imu import ImuConfig
-from smartnav_graph.factors.magnetometer import MagnetometerConfig
-from smartnav_graph.factors.pedestrian import StepConfig
-from smartnav_graph.factors.pose_fix import PoseFixConfig
-from smartnav_graph.factors.prior import PriorConfig
-from smartnav_graph.factors.smart import SmartConfig
-from smartnav_graph.factors.vehicle import VehicleConfig
-from smartnav_graph.factors.velocity import VelocityConfig
-from smartnav_graph.factors.wheel import WheelConfig
+from smartnav_graph.factors import FACTORS
 from smartnav_graph.graph.keyframes import KeyframeConfig
-from smartnav_graph.session.detect.standstills import StandstillConfig
 from smartnav_graph.session.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
 from smartnav_graph.smoothers.incremental import ReplayConfig
@@ -37,7 +23,7 @@ from smartnav_graph.smoothers.minimise import SolveConfig
 
 @dataclass(frozen=True)
 class GapConfig:
-    """What counts as a hole in the inertial data; see `timebase.find_gaps`."""
+    """What counts as a gap in the inertial data; see `timebase.find_gaps`."""
 
     missing_s: float = 0.05
     bridged_rows: int = 5
@@ -80,31 +66,29 @@ class RunConfig:
 
 
 @dataclass(frozen=True)
-class Config:
-    """All options. Sections are the rooms, fields their options."""
+class GeneralConfig:
+    """The sections that belong to no factor."""
 
     run: RunConfig = field(default_factory=RunConfig)
     gaps: GapConfig = field(default_factory=GapConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     initialise: InitialiseConfig = field(default_factory=InitialiseConfig)
-    prior: PriorConfig = field(default_factory=PriorConfig)
-    imu: ImuConfig = field(default_factory=ImuConfig)
-    gnss: GnssConfig = field(default_factory=GnssConfig)
-    control: ControlConfig = field(default_factory=ControlConfig)
-    pose_fixes: PoseFixConfig = field(default_factory=PoseFixConfig)
-    standstill: StandstillConfig = field(default_factory=StandstillConfig)
-    magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
-    gravity: GravityConfig = field(default_factory=GravityConfig)
-    vehicle: VehicleConfig = field(default_factory=VehicleConfig)
-    velocity: VelocityConfig = field(default_factory=VelocityConfig)
-    wheel: WheelConfig = field(default_factory=WheelConfig)
-    barometer: BarometerConfig = field(default_factory=BarometerConfig)
-    steps: StepConfig = field(default_factory=StepConfig)
-    coplanarity: CoplanarityConfig = field(default_factory=CoplanarityConfig)
-    smart: SmartConfig = field(default_factory=SmartConfig)
     batch: BatchConfig = field(default_factory=BatchConfig)
-    solve: SolveConfig = field(default_factory=SolveConfig)
+    solver: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
+
+
+_OF_FACTORS = {factor.section: factor.config for factor in FACTORS.values() if factor.config is not None}
+FactorConfigs: Any = dataclasses.make_dataclass(
+    "FactorConfigs",
+    [(section, kind, field(default_factory=kind)) for section, kind in _OF_FACTORS.items()],
+    frozen=True,
+)
+
+
+@dataclass(frozen=True)
+class Config(FactorConfigs, GeneralConfig):  # type: ignore[misc]
+    """All options: the sections of `GeneralConfig`, and one section for each of the factors (`FACTORS`)."""
 
 
 _converter = cattrs.Converter(forbid_extra_keys=True)

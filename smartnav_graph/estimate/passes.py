@@ -167,7 +167,7 @@ def solve_passes(
     robust = pass_state.phase is Phase.ROBUST and not coarse_start
     error_m = PREDICTION_ERROR_M if robust else 0.0
     pass_ = Pass(pass_state, limit, 1, initial_values, initial_values, coarse_start, error_m)
-    builders, precision = [prior, *problem.builders], FIRST if coarse_start else problem.config.solve
+    builders, precision = [prior, *problem.builders], FIRST if coarse_start else problem.config.solver
     while True:
         pass_ = _ready(pass_, problem, windows, prior, progress)
         smoother = Batch(

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors import BUILDERS
+from smartnav_graph.factors import FACTORS, make_builders
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.gap_model import bridged
 from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph import delayed
-from smartnav_graph.graph.keyframes import keyframe_times, make_windows
+from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session import health
@@ -27,7 +27,7 @@ from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Positioned
+from smartnav_graph.session.stream import Positioned, Stream
 from smartnav_graph.vision.pairs import Pairs
 from smartnav_graph.vision.zero_motion import still_periods
 
@@ -110,17 +110,21 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     gaps = [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
-    pairs = pairs_of(session, config.coplanarity, smart=config.smart.enabled)
+    pairs = pairs_of(session, config.image_pairs, smart=config.smart.enabled)
     seen = None if pairs is None else still_periods(pairs)
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still, seen)
-    context = FactorContext(session, calibration, gaps, vehicle, config, rests, causal, pairs)
+    context = FactorContext(
+        *(session, calibration, gaps, vehicle, config, rests, causal, pairs),
+        session_states_fixed=config.replay.smoother == "isam2",
+        polished=config.replay.polish,
+    )
     windows, lost = cut(context, span)
     for name, count in lost.items():
         dropped.setdefault(name, {})["arrived after the end"] = count
     builders = make_builders(context)
     for name, counts in session.dropped.items():
         dropped[name] = {**dropped.get(name, {}), **counts}
-    notes = [note for b in builders if (note := getattr(b, "note", ""))]
+    notes = [builder.note for builder in builders if builder.note]
     warnings = [*warnings, *told, *notes, *_unused(session), *(_dropped_text(name, c) for name, c in dropped.items())]
     return Problem(session, config, calibration, windows, gaps, builders, withheld, dropped, warnings, rests, pairs)
 
@@ -137,7 +141,7 @@ def _calibrated(session: Session) -> Session:
 def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], dict[str, int]]:
     """The windows of a stretch, and how many rows of each stream are not known by its end."""
     session, causal = context.session, context.causal
-    spacing = context.config.keyframes
+    spacing = context.options(KeyframeConfig)
     rests = context.rests or Standstills.none(session.require_imu().t_ns)
     if rests.on_foot:  # a foot swings fast: what happens between keyframes would be told poorly
         spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, SWING_S))
@@ -150,11 +154,6 @@ def cut(context: FactorContext, span: tuple[int, int]) -> tuple[list[Window], di
     imu = bridged(session.require_imu(), context.gaps, context.bridges)
     windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
     return delayed.assign(windows, streams, merge) if causal else (windows, {})
-
-
-def make_builders(context: FactorContext) -> list[Builder]:
-    """The builders of everything that a session has."""
-    return [builder for make in BUILDERS.values() if (builder := make(context)) is not None]
 
 
 def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
@@ -209,7 +208,7 @@ def _inside_span(session: Session, span: tuple[int, int]) -> tuple[Session, dict
     """Absolute streams cut to the span. Rows beyond the inertial data are counted, rows beyond --from/--to are not."""
     imu = session.require_imu()
     dropped: dict[str, dict[str, int]] = {}
-    changes: dict[str, Positioned | None] = {}
+    changes: dict[str, Stream | None] = {}
     for name, stream in session.absolute().items():
         outside = int(((stream.t_ns < imu.t_ns[0]) | (stream.t_ns > imu.t_ns[-1])).sum())
         if outside:
@@ -248,7 +247,7 @@ def _trimmed(
 
 def _unused(session: Session) -> list[str]:
     """Streams that are there but have no factor."""
-    used = {*BUILDERS, "reference", "images", "tracks", "matches"}
+    used = {factor.stream for factor in FACTORS.values()} | {"reference", "images"}
     idle = [name for name in session.streams() if name not in used]
     told = [f"{name}: present, not used by the estimator" for name in idle]
     images = session.images

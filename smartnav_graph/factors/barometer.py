@@ -27,7 +27,7 @@ from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import BarometerNoise
 from smartnav_graph.session.streams import Barometer
@@ -90,7 +90,7 @@ MODEL = AtKeyframe(Height())
 
 
 @dataclass
-class BarometerBuilder:
+class BarometerBuilder(Builder):
     """Adds the bias of every keyframe, and its height where samples are near.
 
     t_ns (n,), height (n,) m over nav zero but for the bias, scale m/hPa; bias_sigma m, of the bias at first
@@ -146,7 +146,7 @@ def build(context: FactorContext) -> BarometerBuilder | None:
     ConfigError
         A pressure reference for a session that does not know where its nav zero is.
     """
-    stream, options = context.session.barometer, context.config.barometer
+    stream, options = context.session.barometer, context.options(BarometerConfig)
     if stream is None:
         return None
     height, sigma = _heights(stream, context), UNKNOWN_HEIGHT
@@ -158,7 +158,7 @@ def build(context: FactorContext) -> BarometerBuilder | None:
 
 def _heights(stream: Barometer, context: FactorContext) -> Floats:
     """Heights (n,) m over nav zero by the pressure reference, or over the first sample without one."""
-    reference, origin = context.config.barometer.reference_hpa, context.session.origin
+    reference, origin = context.options(BarometerConfig).reference_hpa, context.session.origin
     if reference is None:
         height = icao_height(stream.pressure_hpa)
         return np.asarray(height - height[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -125,8 +125,19 @@ def seen_from(xy_n: Floats, turn: Floats) -> Floats:
     return np.asarray(ray[:, :2] / ray[:, 2:])
 
 
-def make_camera_model(context: FactorContext, config: Any) -> CameraModel:
-    """The camera of a session; `config` is the coplanarity's, which has the options of the camera."""
+class CameraOptions(Protocol):
+    """Options of a camera: prior sigmas deg and s (None: as calibrated), whether rows have their own time."""
+
+    @property
+    def boresight_sigma_deg(self) -> float | None: ...
+    @property
+    def time_offset_sigma(self) -> float | None: ...
+    @property
+    def row_time(self) -> bool: ...
+
+
+def make_camera_model(context: FactorContext, config: CameraOptions) -> CameraModel:
+    """The camera of a session, by the options of its image pairs."""
     camera = context.camera or UNKNOWN_CAMERA
     mount = context.session.mount(context.camera_name)
     degrees = camera.boresight_sigma_deg if config.boresight_sigma_deg is None else config.boresight_sigma_deg

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors import gap_model
 from smartnav_graph.factors.gap_model import Bridge
@@ -19,21 +19,35 @@ from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.pairs import Pairs
 
+Section = TypeVar("Section")
+
 
 @dataclass(frozen=True)
 class FactorContext:
-    """The session without its withheld rows, the device's calibration, holes of the inertial data, what carries the
-    device (none, car, trolley, foot), the options of all rooms (`config.Config`, which stands below this room), the
-    standstills of the recording, whether nothing may be learnt from what comes later (replay), and its image pairs."""
+    """What the builders of one problem are made of.
+
+    session : without its withheld rows; gaps : of the inertial data; vehicle : none, car, trolley or foot
+    config : a dataclass whose fields are the sections of the configuration; see `options`
+    rests : standstills of the recording; causal : replay, where nothing may be learned from later data
+    pairs : image pairs of the session
+    session_states_fixed : the smoother of a replay keeps session states at their initial values
+    polished : a batch solution follows the replay
+    """
 
     session: Session
     calibration: Calibration
     gaps: Sequence[Gap]
     vehicle: str
-    config: Any
+    config: object
     rests: Standstills | None = None
     causal: bool = False
     pairs: Pairs | None = None
+    session_states_fixed: bool = False
+    polished: bool = True
+
+    def options(self, kind: type[Section]) -> Section:
+        """The section of the configuration that is a `kind`, such as `GnssConfig`."""
+        return next(section for section in vars(self.config).values() if isinstance(section, kind))
 
     @cached_property
     def bridges(self) -> Mapping[int, Bridge]:
@@ -52,7 +66,7 @@ class FactorContext:
         return self.calibration.cameras.get(self.camera_name)
 
     @property
-    def image_ns(self) -> NDArray[np.int64]:
+    def image_ns(self) -> Times:
         """Stamps of the keyframes at the images of the pairs, by the clock offset that the calibration knows."""
         if self.pairs is None:
             return np.zeros(0, dtype=np.int64)

@@ -27,12 +27,13 @@ class ControlConfig:
 
 def build(context: FactorContext) -> PositionBuilder | None:
     """The builder of a session's surveyed points. Whoever stood on a point read the clock of the device itself."""
-    stream, options = context.session.control, context.config.control
+    stream, options = context.session.control, context.options(ControlConfig)
     if stream is None:
         return None
+    gnss = context.options(GnssConfig)
     config = GnssConfig(
-        loss=context.config.gnss.loss,
-        gate_probability=context.config.gnss.gate_probability,
+        loss=gnss.loss,
+        gate_probability=gnss.gate_probability,
         estimate_sigma=False,
         correlated=False,
         time_offset_sigma=0.0,

@@ -23,9 +23,10 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.camera import BodyRates, CameraModel, Motion, make_camera_model, seen_from
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
+from smartnav_graph.graph.keyframes import KeyframeConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.gating import gate
@@ -65,10 +66,10 @@ class CoplanarityConfig:
     def __post_init__(self) -> None:
         if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1):
             found = f"rate_hz = {self.rate_hz}, spans = {self.spans}"
-            raise ConfigError("config [coplanarity]", found, "> 0, whole numbers >= 1")
+            raise ConfigError("config [image_pairs]", found, "> 0, whole numbers >= 1")
         given = (self.least_parallax, self.boresight_sigma_deg or 0.0, self.time_offset_sigma or 0.0)
         if not min(given) >= 0:
-            raise ConfigError("config [coplanarity]", f"{self}", "parallax and sigmas >= 0")
+            raise ConfigError("config [image_pairs]", f"{self}", "parallax and sigmas >= 0")
 
 
 # Why a pair is not used, in words.
@@ -83,7 +84,7 @@ IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
 
 
 @dataclass
-class CoplanarityBuilder:
+class CoplanarityBuilder(Builder):
     """Adds the pairs that end at a keyframe.
 
     seen : pairs as they were matched; pairs : as they were in the first row of each image, by the motion found
@@ -101,7 +102,7 @@ class CoplanarityBuilder:
     merge_ns: int
     config: CoplanarityConfig = field(default_factory=CoplanarityConfig)
     note: str = ""
-    name: str = "coplanarity"
+    name: str = "image_pairs"
     stage: int = 1
     pairs: Pairs = field(init=False)
     verdict: NDArray[np.intp] = field(init=False)
@@ -308,7 +309,7 @@ def pairs_of(session: Session, config: CoplanarityConfig, *, smart: bool = False
 
 def build(context: FactorContext) -> CoplanarityBuilder | None:
     """The builder of a session's image pairs."""
-    pairs, config = context.pairs, context.config.coplanarity
+    pairs, config = context.pairs, context.options(CoplanarityConfig)
     if pairs is None or not len(pairs) or not config.enabled:
         return None
     camera_model = make_camera_model(context, config)
@@ -318,6 +319,6 @@ def build(context: FactorContext) -> CoplanarityBuilder | None:
         BodyRates(context.session.require_imu()),
         camera_model,
         sigma=camera_model.camera.noise,
-        merge_ns=round(context.config.keyframes.merge_s * NS),
+        merge_ns=round(context.options(KeyframeConfig).merge_s * NS),
         config=config,
     )

@@ -26,11 +26,11 @@ from smartnav_graph.factors.observation import PartialPreintegration, here, prei
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Positioned
+from smartnav_graph.session.stream import Positioned
 
 LEAST_WANDERING_SIGMA = 0.5  # m
 
@@ -119,7 +119,7 @@ def noise_model(sigmas: Floats, loss: str) -> gtsam.noiseModel.Base:
 
 
 @dataclass
-class PositionBuilder:
+class PositionBuilder(Builder):
     """Adds one position factor a fix.
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
@@ -202,7 +202,7 @@ class PositionBuilder:
         known.append(square)
         return bool(self.gate(np.array([square]), level, np.array([row]))[0])
 
-    def grows(self, pass_state: PassState) -> bool:
+    def has_second_stage(self, pass_state: PassState) -> bool:
         """Whether there is more to these fixes once the trajectory is found: states of their own."""
         return bool(self._states(replace(pass_state, stage=LAST_STAGE))) or self.wanders(pass_state)
 
@@ -299,4 +299,6 @@ def build(context: FactorContext) -> PositionBuilder | None:
     stream = context.session.gnss
     if stream is None:
         return None
-    return PositionBuilder.of(context.session, "gnss", stream, context.calibration.gnss_noise, context.config.gnss)
+    return PositionBuilder.of(
+        context.session, "gnss", stream, context.calibration.gnss_noise, context.options(GnssConfig)
+    )

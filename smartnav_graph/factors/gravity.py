@@ -32,7 +32,7 @@ from smartnav_graph.factors.magnetometer import turned_mean
 from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.streams import ABSOLUTE
 
@@ -112,7 +112,7 @@ class Stretch:
 
 
 @dataclass
-class GravityBuilder:
+class GravityBuilder(Builder):
     """Adds one row a stretch. held_ns (n,) : stamps of everything that holds tilt; gravity m/s^2."""
 
     gravity: float
@@ -171,7 +171,7 @@ REST_SCATTER = 0.1
 
 def build(context: FactorContext) -> GravityBuilder | None:
     """The tilt of whoever has nothing else."""
-    config = context.config.gravity
+    config = context.options(GravityConfig)
     carried = context.vehicle == "foot" and not context.on_foot  # a car nobody declared is no walker
     if config.enabled == "off" or (config.enabled == "auto" and not carried):
         return None

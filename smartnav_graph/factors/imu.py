@@ -25,7 +25,7 @@ from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
 
@@ -106,7 +106,7 @@ class Preintegrated:
 
 
 @dataclass
-class ImuBuilder:
+class ImuBuilder(Builder):
     """Adds `ImuFactor` and the bias walk, and predicts the state at the window's end.
 
     gravity m/s^2; `bridges` gives the noise of each gap by its start stamp; weight : degrees of freedom that `noise`
@@ -124,7 +124,7 @@ class ImuBuilder:
     cache: Preintegrated = field(default_factory=Preintegrated)
     _straying: gap_error.Straying = field(default_factory=gap_error.Straying)
 
-    def grows(self, pass_state: PassState) -> bool:
+    def has_second_stage(self, pass_state: PassState) -> bool:
         """Whether there is more to learn once the trajectory is found: the noise, scale factors."""
         return self.config.estimate_noise or self.config.scale_sigma > 0
 
@@ -276,5 +276,5 @@ def build(context: FactorContext) -> ImuBuilder:
     noise = context.calibration.imu_noise
     known = noise != DEVICE_CLASSES[context.calibration.device_class]
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
-    gravity, options = context.session.gravity, context.config.imu
+    gravity, options = context.session.gravity, context.options(ImuConfig)
     return ImuBuilder(noise, gravity, context.gaps, context.bridges, options, weight=weight)

@@ -32,7 +32,7 @@ from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import MagnetometerNoise
 from smartnav_graph.session.streams import Magnetometer
@@ -115,7 +115,7 @@ def turned_mean(window: Window, t_ns: NDArray[np.int64], field_ut: Floats, gyro_
 
 
 @dataclass
-class MagnetometerBuilder:
+class MagnetometerBuilder(Builder):
     """Adds one row a window: the mean of its samples.
 
     reading (n, 3) uT as recorded, t_ns (n,); field_ut (2,) horizontal and vertical strength with field_sigma (2,);
@@ -208,7 +208,7 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
     Readings whose first second is stronger than any field on Earth hold an uncalibrated hard iron of that size. Where
     no positions tell the heading, the magnetometer takes part from the first pass on.
     """
-    stream, config = context.session.magnetometer, context.config.magnetometer
+    stream, config = context.session.magnetometer, context.options(MagnetometerConfig)
     if stream is None or not config.enabled:
         return None
     noise, nav_field = context.calibration.magnetometer_noise, context.session.magnetic_field_ut
@@ -226,7 +226,7 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
         noise,
         config,
         stage=LAST_STAGE if context.session.absolute() else 0,
-        held_in_replay=context.config.replay.smoother == "isam2",
+        held_in_replay=context.session_states_fixed,
     )
 
 

@@ -28,9 +28,10 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
+from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import StepNoise
 from smartnav_graph.session.detect.steps import Steps, find_steps, regular_share
@@ -98,7 +99,7 @@ def model_of(forward: str, up: str) -> Stride:
 
 
 @dataclass
-class StepBuilder:
+class StepBuilder(Builder):
     """Adds one row a window in which steps are known and fixes are far apart.
 
     fixes_ns : stamps of good fixes, in time order; note : what the run is told of it
@@ -164,7 +165,7 @@ class StepBuilder:
 
 def build(context: FactorContext) -> StepBuilder | None:
     """The builder of a walker's steps; none for a foot-mounted device, whose stances say more."""
-    config, session = context.config.steps, context.session
+    config, session = context.options(StepConfig), context.session
     by_hand = context.vehicle in ("foot", "none") and not context.on_foot
     if config.enabled == "off" or (config.enabled == "auto" and not by_hand):
         return None
@@ -189,7 +190,7 @@ def _good_fixes(context: FactorContext) -> NDArray[np.int64]:
     found = [np.zeros(0, np.int64)]
     for stream, usual in (
         (session.gnss, context.calibration.gnss_noise.horizontal_sigma),
-        (session.control, context.config.control.default_sigma),
+        (session.control, context.options(ControlConfig).default_sigma),
         (session.pose_fixes, context.calibration.pose_fix_noise.position_sigma),
     ):
         if stream is not None:

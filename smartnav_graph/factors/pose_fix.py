@@ -28,7 +28,7 @@ from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
 from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import SessionState, State
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.session.session import Session
@@ -112,7 +112,7 @@ class PoseFixBuilder(PositionBuilder):
 
 
 @dataclass
-class AttitudeBuilder:
+class AttitudeBuilder(Builder):
     """Adds the attitude of every pose fix that has one, beside its position.
 
     attitude (n, 3, 3) nav_R_sensor, known (n,) which rows have one, mount (3, 3) body_R_sensor, sigma (n, 3) rad nav
@@ -193,7 +193,7 @@ class AttitudeBuilder:
 
 def build(context: FactorContext) -> PoseFixBuilder | None:
     """The builder of the positions of a session's pose fixes."""
-    stream, config = context.session.pose_fixes, context.config.pose_fixes
+    stream, config = context.session.pose_fixes, context.options(PoseFixConfig)
     if stream is None:
         return None
     stated = NAME in context.session.sensors
@@ -212,7 +212,7 @@ def build(context: FactorContext) -> PoseFixBuilder | None:
 
 def build_attitude(context: FactorContext) -> AttitudeBuilder | None:
     """The builder of the attitudes of a session's pose fixes."""
-    stream, config = context.session.pose_fixes, context.config.pose_fixes
+    stream, config = context.session.pose_fixes, context.options(PoseFixConfig)
     if stream is None or stream.quat is None or not config.attitude:
         return None
     attitude, known = attitudes(stream)

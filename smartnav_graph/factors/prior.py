@@ -16,7 +16,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.factors.magnetometer import IRON
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 
 UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
@@ -37,7 +37,7 @@ class PriorConfig:
 
 
 @dataclass
-class PriorBuilder:
+class PriorBuilder(Builder):
     """Prior factors at the first keyframe.
 
     start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,

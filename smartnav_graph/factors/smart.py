@@ -31,10 +31,11 @@ from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.camera import BodyRates, CameraModel, make_camera_model
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.coplanarity import SMART
+from smartnav_graph.factors.coplanarity import SMART, CoplanarityConfig
+from smartnav_graph.graph.keyframes import KeyframeConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.vision.points import Sightings, of_tracks
 
@@ -76,7 +77,7 @@ IN_USE, OUTSIDE, FEW, FLAT, CONTRARY = range(len(REASONS))
 
 
 @dataclass
-class SmartBuilder:
+class SmartBuilder(Builder):
     """Adds a track at the keyframe that saw it last.
 
     image_ns (k,) : keyframe stamps of the images; sigma : of an observation, normalised
@@ -163,23 +164,23 @@ def build(context: FactorContext) -> SmartBuilder | None:
     ConfigError
         There are none, or nothing would use them.
     """
-    config, pairs, tracks = context.config.smart, context.pairs, context.session.tracks
+    config, pairs, tracks = context.options(SmartConfig), context.pairs, context.session.tracks
     if not config.enabled:
         return None
     if tracks is None or pairs is None:
         found = "enabled, but the session has no tracks"
         raise ConfigError("config [smart]", found, "tracks.parquet", "make them with `smartnav match --features klt`")
-    if context.causal and not context.config.replay.polish:
+    if context.causal and not context.polished:
         found = "enabled in a replay without its polish"
         expected = "a batch run or a polish: a track is settled once all of it was seen"
         raise ConfigError("config [smart]", found, expected, "leave replay.polish on, or smart off")
-    camera_model = make_camera_model(context, context.config.coplanarity)
+    camera_model = make_camera_model(context, context.options(CoplanarityConfig))
     return SmartBuilder(
         of_tracks(tracks, pairs.t_ns, config.most_seen),
         context.image_ns,
         BodyRates(context.session.require_imu()),
         camera_model,
         camera_model.camera.noise,
-        round(context.config.keyframes.merge_s * NS),
+        round(context.options(KeyframeConfig).merge_s * NS),
         config,
     )

@@ -27,7 +27,7 @@ from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.detect.standstills import StandstillConfig, Standstills
 
@@ -63,7 +63,7 @@ MODEL = AtKeyframe(Level())
 
 
 @dataclass
-class StandstillBuilder:
+class StandstillBuilder(Builder):
     """Adds what a standstill says at each keyframe inside one.
 
     rests : the standstills of the recording; _floor : the floor's state, once a stance has been seen
@@ -124,4 +124,4 @@ def build(context: FactorContext) -> StandstillBuilder | None:
     """The builder, where a session stands still at all."""
     if context.rests is None or not context.rests.still.any():
         return None
-    return StandstillBuilder(context.rests, context.config.standstill)
+    return StandstillBuilder(context.rests, context.options(StandstillConfig))

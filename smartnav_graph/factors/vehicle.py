@@ -15,7 +15,7 @@ Dynamics, ch. 6, on cornering compliance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ from smartnav_graph.factors.observation import AtKeyframe
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import STATES, SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import VEHICLE_CLASSES, VehicleNoise
 from smartnav_graph.session.detect.standstills import Standstills
@@ -191,7 +191,7 @@ def due(window: Window, period_s: float) -> bool:
 
 
 @dataclass
-class VehicleBuilder:
+class VehicleBuilder(Builder):
     """Adds one row of the constraint a period, outside standstills, and in gaps where rate and force have a state.
 
     body_R_vehicle (3, 3) : declared axes; gaps : where rate and force were not recorded; rests : where zero velocity
@@ -209,8 +209,11 @@ class VehicleBuilder:
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
         self.strayed = AtKeyframe(NonHolonomic(self.body_R_vehicle, strays=True))
-        noise = self.noise
-        self.noise_groups = {"vehicle_lateral": noise.lateral_sigma, "vehicle_vertical": noise.vertical_sigma}
+
+    @property
+    def noise_groups(self) -> Mapping[str, float]:
+        """See `Builder`."""
+        return {"vehicle_lateral": self.noise.lateral_sigma, "vehicle_vertical": self.noise.vertical_sigma}
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where one is due."""
@@ -236,7 +239,7 @@ class VehicleBuilder:
 
 def build(context: FactorContext) -> VehicleBuilder | None:
     """The constraint of a declared vehicle on wheels."""
-    noise, config = VEHICLE_CLASSES.get(context.vehicle), context.config.vehicle
+    noise, config = VEHICLE_CLASSES.get(context.vehicle), context.options(VehicleConfig)
     if noise is None or not config.enabled:
         return None
     device = context.session.device

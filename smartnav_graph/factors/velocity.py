@@ -24,7 +24,7 @@ from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.streams import Velocity
 
@@ -94,7 +94,7 @@ def rate_at_end(window: Window, bias: Any) -> Floats:
 
 
 @dataclass
-class GnssVelocityBuilder:
+class GnssVelocityBuilder(Builder):
     """Adds the velocities that come with position fixes, at their keyframes and on their clock.
 
     velocity (n, 3) m/s nav axes, rows that are not known NaN; sigma (n, 3) m/s; lever (3,) m body axes; gravity m/s^2
@@ -129,7 +129,7 @@ class GnssVelocityBuilder:
 
 
 @dataclass
-class BodyVelocityBuilder:
+class BodyVelocityBuilder(Builder):
     """Adds one body velocity a keyframe, interpolated between the readings around it."""
 
     stream: Velocity
@@ -166,7 +166,7 @@ class BodyVelocityBuilder:
 
 def build_gnss(context: FactorContext) -> GnssVelocityBuilder | None:
     """The builder of velocities in a session's GNSS fixes."""
-    fixes, config, noise = context.session.gnss, context.config.velocity, context.calibration.gnss_noise
+    fixes, config, noise = context.session.gnss, context.options(VelocityConfig), context.calibration.gnss_noise
     if fixes is None or fixes.velocity is None or not config.gnss:
         return None
     h, v = noise.velocity_horizontal_sigma, noise.velocity_vertical_sigma
@@ -174,7 +174,7 @@ def build_gnss(context: FactorContext) -> GnssVelocityBuilder | None:
     if fixes.sigma_velocity is not None:
         sigma = np.where(np.isfinite(fixes.sigma_velocity), fixes.sigma_velocity, sigma)
     lever = np.asarray(context.session.mount("gnss").body_t, dtype=np.float64)
-    gnss, gravity = context.config.gnss, context.session.gravity
+    gnss, gravity = context.options(GnssConfig), context.session.gravity
     return GnssVelocityBuilder(np.asarray(fixes.velocity), sigma, lever, gravity, gnss, config)
 
 
@@ -184,4 +184,4 @@ def build(context: FactorContext) -> BodyVelocityBuilder | None:
     if stream is None:
         return None
     lever = np.asarray(context.session.mount("velocity").body_t, dtype=np.float64)
-    return BodyVelocityBuilder(stream, lever, context.config.velocity)
+    return BodyVelocityBuilder(stream, lever, context.options(VelocityConfig))

@@ -8,7 +8,7 @@ a keyframe gives speed and slope there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ from smartnav_graph.factors.vehicle import (
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import FactorBatch, GraphUpdate
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import VEHICLE_CLASSES
 from smartnav_graph.session.streams import WheelSpeed
@@ -95,7 +95,7 @@ class RearWheels:
 
 
 @dataclass
-class WheelBuilder:
+class WheelBuilder(Builder):
     """Adds one row a period where readings surround the keyframe.
 
     body_R_vehicle (3, 3) : declared axes; default_sigma : m/s, of readings that carry none. Such a sigma stands for
@@ -114,7 +114,11 @@ class WheelBuilder:
     def __post_init__(self) -> None:
         self.model = AtKeyframe(RearWheels(self.body_R_vehicle))
         self._unsigned = bool((self.stream.speed >= 0).all())
-        self.noise_groups = {self.name: self.default_sigma} if self.stream.sigma is None else {}
+
+    @property
+    def noise_groups(self) -> Mapping[str, float]:
+        """See `Builder`."""
+        return {self.name: self.default_sigma} if self.stream.sigma is None else {}
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where one is due."""
@@ -155,4 +159,4 @@ def build(context: FactorContext) -> WheelBuilder | None:
         return None
     noise = VEHICLE_CLASSES.get(context.vehicle, VEHICLE_CLASSES["car"])
     axes = frames.body_R_vehicle(device.forward, device.up)
-    return WheelBuilder(stream, axes, noise.wheel_sigma, context.config.wheel, context.config.vehicle)
+    return WheelBuilder(stream, axes, noise.wheel_sigma, context.options(WheelConfig), context.options(VehicleConfig))

@@ -13,7 +13,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Mask
 from smartnav_graph.graph.windows import DelayedRow, Window
-from smartnav_graph.session.streams import Stream
+from smartnav_graph.session.stream import Stream
 
 
 def is_delayed(stream: Stream, merge_ns: int) -> Mask:

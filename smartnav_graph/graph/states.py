@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -60,11 +61,6 @@ STATES: dict[str, StateKind] = {
     )
 }
 KEYFRAME_LETTERS = tuple(kind.letter for kind in STATES.values() if kind.scope == "keyframe")
-# A session state's index is its sensor's place here.
-SENSORS = (
-    *("imu", "gnss", "control", "pose_fixes", "velocity", "wheel", "vehicle", "magnetometer", "barometer", "steps"),
-    *("images", "tracks", "matches", "static"),
-)
 
 
 def kind_of(name: int) -> StateKind:
@@ -92,10 +88,19 @@ def key(letter: str, index: int) -> int:
     return int(gtsam.symbol(letter, index))
 
 
+@lru_cache(maxsize=1 << 16)
+def session_key(letter: str, sensor: str, instance: str = "") -> int:
+    """GTSAM key of a session state. Its index is a digest of sensor and instance, of all bits that a key has for it:
+    the same in every run, and different for different names (`GraphUpdate.use` checks it)."""
+    digest = hashlib.blake2b(f"{sensor}\0{instance}".encode(), digest_size=7).digest()
+    return key(letter, int.from_bytes(digest))
+
+
 @dataclass(frozen=True)
 class SessionState:
     """One state for the whole session, with its prior.
 
+    sensor, instance : whose it is; a sensor may have many of a kind, such as a bias for each of its anchors
     name : as in summary.json, with its unit (``gnss_time_offset_s``); initial (d,), sigma (d,) of the prior
     """
 
@@ -104,10 +109,12 @@ class SessionState:
     name: str
     initial: Floats
     sigma: Floats
+    instance: str = ""
 
     @property
     def key(self) -> int:
-        return key(self.letter, SENSORS.index(self.sensor))
+        """Its GTSAM key."""
+        return session_key(self.letter, self.sensor, self.instance)
 
 
 @dataclass(frozen=True)

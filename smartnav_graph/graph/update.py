@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, SessionState, State, key
 from smartnav_graph.graph.windows import Window
 
@@ -111,7 +111,9 @@ class GraphUpdate:
     constants: dict[int, SessionState] = field(default_factory=dict)
 
     def use(self, state: SessionState) -> int:
-        """Key of a session state that a factor of this step touches."""
+        """Key of a session state that a factor of this update touches."""
+        if self.session.setdefault(state.key, state).name != state.name:
+            raise ValueError(f"{state.name} and {self.session[state.key].name} have the same key")
         self.session[state.key] = state
         return state.key
 
@@ -158,15 +160,35 @@ class GraphUpdate:
         return values
 
 
-class Builder(Protocol):
-    """Adds the factors of one sensor to a step, from its `stage` on."""
+class Builder:
+    """Adds the factors of one sensor to the graph. A subclass says more of itself than the defaults where it must.
+
+    name : of its factors; stage : of the passes that it takes part in first (see `PassState`)
+    lookahead_s : how far beyond the end of a window it reads; note : a warning for the run, empty for none
+    """
 
     name: str
-    stage: int
+    stage: int = 0
+    lookahead_s: float = 0.0
+    note: str = ""
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Add this sensor's factors for `window`; `previous` is the latest state (None at the first keyframe)."""
-        ...
+        raise NotImplementedError
+
+    def has_second_stage(self, pass_state: PassState) -> bool:
+        """Whether it adds more, or has noise to estimate, once the trajectory is found."""
+        return self.stage == LAST_STAGE
+
+    @property
+    def gate_probability(self) -> float | None:
+        """Share of good rows inside the outlier gate of its rows; None where no outliers are looked for."""
+        return None
+
+    @property
+    def noise_groups(self) -> Mapping[str, float]:
+        """Class-default sigmas that a run may estimate: by group, one for each axis of the residual."""
+        return {}
 
 
 Kind = TypeVar("Kind")

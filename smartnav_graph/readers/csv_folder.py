@@ -15,7 +15,8 @@ from smartnav_graph.readers.text import TextTable, read_text
 from smartnav_graph.session import repair
 from smartnav_graph.session.folder import read_header
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import STREAMS, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import STREAMS
 
 NAME = "csv"
 

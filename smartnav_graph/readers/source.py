@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.session.folder import build_stream
 from smartnav_graph.session.session import Mount, Session
-from smartnav_graph.session.streams import STREAMS, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import STREAMS
 
 Columns = dict[str, NDArray[Any]]
 

@@ -18,7 +18,8 @@ from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.session import repair
 from smartnav_graph.session.calibration import model as calibration_model
 from smartnav_graph.session.session import Device, Mount, Session
-from smartnav_graph.session.streams import STREAMS, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import STREAMS
 
 SCHEMA = 1
 PICTURES = "images"  # the folder of the pictures in that of the session

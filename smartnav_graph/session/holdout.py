@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Positioned
+from smartnav_graph.session.stream import Positioned
 
 EXPECTED = "SENSOR:every=N or SENSOR:outage=FROM-TO (seconds), for example gnss:every=10 or gnss:outage=100-130"
 
@@ -65,7 +65,7 @@ def split(session: Session, specs: Iterable[str]) -> tuple[Session, dict[str, Po
     for spec in (Withhold.parse(text) for text in specs):
         stream = session.streams().get(spec.sensor)
         if not isinstance(stream, Positioned):
-            there = [name for name, s in session.streams().items() if isinstance(s, Positioned)]
+            there = list(session.positions())
             raise ConfigError(
                 "--withhold", f"no stream of positions {spec.sensor!r}", f"one of {', '.join(there) or 'none here'}"
             )

@@ -18,7 +18,8 @@ from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session.streams import Imu, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import Imu
 
 Table = dict[str, NDArray[Any]]
 

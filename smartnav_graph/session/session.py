@@ -17,26 +17,8 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.session.calibration.model import Calibration
-from smartnav_graph.session.streams import (
-    ABSOLUTE,
-    STREAMS,
-    Barometer,
-    ControlPoint,
-    GnssFix,
-    Images,
-    Imu,
-    Magnetometer,
-    Matches,
-    PoseFix,
-    Positioned,
-    Reference,
-    StaticPeriod,
-    Stream,
-    Temperature,
-    Tracks,
-    Velocity,
-    WheelSpeed,
-)
+from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.streams import Imu, Streams
 
 SCHEMA = 1
 PICTURES = "images"  # the folder of the pictures in that of the session
@@ -73,12 +55,12 @@ class Mount:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Session:
-    """Everything recorded, on one clock.
+class Session(Streams):
+    """Everything recorded, on one clock: its streams and what is known of the device.
 
-    Streams are optional; `origin` may be absent (metric local positions only). `gravity_m_s2` overrides normal
-    gravity. `repairs` names the repairs applied when the session is loaded; `dropped` counts what they touched.
-    `pictures` is the folder that the files of the images count from; saving copies those that are there.
+    `origin` may be absent (metric local positions only). `gravity_m_s2` overrides normal gravity. `repairs` names the
+    repairs applied when the session is loaded; `dropped` counts what they touched. `pictures` is the folder that the
+    files of the images count from; saving copies those that are there.
     """
 
     device: Device = Device()
@@ -92,21 +74,6 @@ class Session:
     path: Path | None = None
     pictures: Path | None = None
 
-    imu: Imu | None = None
-    gnss: GnssFix | None = None
-    control: ControlPoint | None = None
-    static: StaticPeriod | None = None
-    pose_fixes: PoseFix | None = None
-    magnetometer: Magnetometer | None = None
-    barometer: Barometer | None = None
-    temperature: Temperature | None = None
-    velocity: Velocity | None = None
-    wheel: WheelSpeed | None = None
-    images: Images | None = None
-    tracks: Tracks | None = None
-    matches: Matches | None = None
-    reference: Reference | None = None
-
     def __post_init__(self) -> None:
         if self.clock_epoch not in EPOCHS:
             raise SessionError("session.toml [clock]", f"epoch = {self.clock_epoch!r}", f"one of {', '.join(EPOCHS)}")
@@ -119,15 +86,6 @@ class Session:
                     "give lat_deg, lon_deg and height_m of the origin",
                     stream=name,
                 )
-
-    def streams(self) -> dict[str, Stream]:
-        """The streams that are there, by name."""
-        there = ((name, getattr(self, name)) for name in STREAMS)
-        return {name: stream for name, stream in there if stream is not None}
-
-    def absolute(self) -> dict[str, Positioned]:
-        """The streams that tell a position by themselves, by name."""
-        return {name: stream for name in ABSOLUTE if (stream := getattr(self, name)) is not None}
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""

@@ -1,196 +1,14 @@
-"""Typed columns: one frozen dataclass a stream, one field a quantity, one file a stream.
-
-Rows are samples; arrays are read-only; every field declares its file columns, so that the table on disk and the
-object in memory are the same thing. A stream checks itself when it is built: shapes, finite values, time order.
-"""
+"""The streams of a session: one dataclass a kind of sensor, one field of `Streams` each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.errors import SessionError
-
-Array = NDArray[Any]
-
-_DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
-
-
-def _columns(*names: str, optional: bool = False, kind: str = "float", nan: bool = False) -> Any:
-    """A field stored as the file columns `names`; `nan` marks a quantity whose rows may be unknown."""
-    meta = {"columns": names, "kind": kind, "nan": nan}
-    return field(metadata=meta) if not optional else field(default=None, metadata=meta)
-
-
-def _axes(template: str, axes: str = "xyz", **kwargs: Any) -> Any:
-    return _columns(*(template.format(axis) for axis in axes), **kwargs)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stream:
-    """Base of every stream. `t_ns` (n,) int64 on the session's clock; `extra` keeps unknown columns."""
-
-    NAME: ClassVar[str]
-    UNIQUE_TIMES: ClassVar[bool] = True
-    ONE_OF: ClassVar[tuple[str, ...]] = ()
-
-    t_ns: NDArray[np.int64] = _columns("t_ns", kind="int")
-    arrival_ns: NDArray[np.int64] | None = _columns("arrival_ns", kind="int", optional=True)
-    extra: Mapping[str, Array] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    @property
-    def available_ns(self) -> NDArray[np.int64]:
-        """When each row (n,) became known."""
-        return self.t_ns if self.arrival_ns is None else self.arrival_ns
-
-    def __post_init__(self) -> None:
-        for spec in self.specs():
-            value = getattr(self, spec.name)
-            if value is not None:
-                object.__setattr__(self, spec.name, self._checked(spec, value))
-        self._check_rows()
-
-    @classmethod
-    def specs(cls) -> list[Field[Any]]:
-        """The fields that are file columns."""
-        return [f for f in fields(cls) if "columns" in f.metadata]
-
-    def _checked(self, spec: Field[Any], value: Any) -> Array:
-        names, kind = spec.metadata["columns"], spec.metadata["kind"]
-        array: Array = np.array(value, dtype=_DTYPES[kind])
-        shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
-        if array.shape != shape:
-            raise SessionError(
-                self.NAME, f"{spec.name} has shape {array.shape}", f"{shape}, one row a time stamp", stream=self.NAME
-            )
-        if kind == "float":
-            bad = np.isinf(array) if spec.metadata["nan"] else ~np.isfinite(array)
-            if bad.any():
-                where = np.argwhere(bad)[0]
-                name = names[int(where[1]) if len(where) > 1 else 0]
-                raise SessionError(
-                    self.NAME,
-                    f"{name} is {array[tuple(where)]} at row {where[0]} ({int(bad.sum())} such values in all)",
-                    "finite numbers",
-                    "correct the row, or add --repair nan to drop such rows, counted",
-                    row=int(where[0]),
-                    stream=self.NAME,
-                )
-        array.flags.writeable = False
-        return array
-
-    def _check_rows(self) -> None:
-        present = [name for name in self.ONE_OF if getattr(self, name) is not None]
-        if self.ONE_OF and len(present) != 1:
-            columns = " or ".join(", ".join(f.metadata["columns"]) for f in self.specs() if f.name in self.ONE_OF)
-            found = "position columns missing" if not present else "both geodetic and local position columns"
-            raise SessionError(self.NAME, found, f"either {columns}", stream=self.NAME)
-        step = np.diff(self.t_ns)
-        bad = np.flatnonzero(step <= 0 if self.UNIQUE_TIMES else step < 0)
-        if len(bad):
-            row = int(bad[0]) + 1
-            raise SessionError(
-                self.NAME,
-                f"t_ns not {'strictly ' if self.UNIQUE_TIMES else ''}increasing at row {row} "
-                f"(step {int(step[row - 1])} ns; {len(bad)} such rows in all)",
-                "> 0" if self.UNIQUE_TIMES else ">= 0",
-                "correct the file, or add --repair order to sort rows and drop repeated stamps, counted",
-                row=row,
-                stream=self.NAME,
-            )
-        early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
-        if len(early):
-            row = int(early[0])
-            lead = int(self.t_ns[row] - np.asarray(self.arrival_ns)[row])
-            raise SessionError(
-                self.NAME,
-                f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)",
-                "a row becomes known at or after the time it speaks of",
-                "correct the column, or leave it out",
-                row=row,
-                stream=self.NAME,
-            )
-        for name in self.__dataclass_fields__:
-            if "sigma" in name and getattr(self, name) is not None:
-                sigma = np.asarray(getattr(self, name))
-                low = np.argwhere(sigma <= 0)
-                if len(low):
-                    raise SessionError(
-                        self.NAME,
-                        f"{name} is {sigma[tuple(low[0])]} at row {low[0][0]}",
-                        "standard deviations > 0",
-                        "leave the value empty where it is not known",
-                        row=int(low[0][0]),
-                        stream=self.NAME,
-                    )
-
-    def take(self, rows: NDArray[Any] | slice) -> Self:
-        """The same stream with only these rows (mask, indices or slice)."""
-        values = {f.name: getattr(self, f.name) for f in self.specs()}
-        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
-        return type(self)(**chosen, extra={name: value[rows] for name, value in self.extra.items()})
-
-    def columns(self) -> dict[str, Array]:
-        """File columns, in order; the inverse of `from_columns`."""
-        out: dict[str, Array] = {}
-        for spec in self.specs():
-            value = getattr(self, spec.name)
-            if value is None:
-                continue
-            names = spec.metadata["columns"]
-            out.update({names[0]: value} if len(names) == 1 else dict(zip(names, value.T, strict=True)))
-        return out | dict(self.extra)
-
-    @classmethod
-    def from_columns(cls, table: Mapping[str, Array]) -> Self:
-        """Build from file columns. Unknown columns are kept in `extra`.
-
-        Raises
-        ------
-        SessionError
-            A required column, or a part of a column group, is missing; or a row is invalid.
-        """
-        values: dict[str, Any] = {}
-        known: set[str] = set()
-        for spec in cls.specs():
-            names = spec.metadata["columns"]
-            there = [name for name in names if name in table]
-            known.update(there)
-            if len(there) == len(names):
-                rows: list[Array] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
-                values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
-            elif there or spec.default is MISSING:
-                missing = [name for name in names if name not in table]
-                raise SessionError(
-                    cls.NAME,
-                    f"column {', '.join(missing)} is missing",
-                    f"columns {', '.join(names)}",
-                    f"the file has {', '.join(table) or 'no columns'}; rename or add the column",
-                    stream=cls.NAME,
-                )
-        return cls(**values, extra={name: np.asarray(table[name]) for name in table if name not in known})
-
-
-_LLA = ("lat_deg", "lon_deg", "height_m")
-_ENU = ("e_m", "n_m", "u_m")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Positioned(Stream):
-    """Rows with a position: `lla` (lat deg, lon deg, ellipsoidal height m) or `enu` metres of the local frame."""
-
-    ONE_OF: ClassVar[tuple[str, ...]] = ("lla", "enu")
-
-    lla: Array | None = _columns(*_LLA, optional=True)
-    enu: Array | None = _columns(*_ENU, optional=True)
-    sigma: Array | None = _axes("sigma_{}_m", "enu", optional=True, nan=True)
+from smartnav_graph.session.stream import ENU, Array, Label, Positioned, Stream, axes, quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,9 +16,10 @@ class Imu(Stream):
     """Angular rate `gyro` (n, 3) rad/s and specific force `accel` (n, 3) m/s^2 in body axes."""
 
     NAME: ClassVar[str] = "imu"
+    LABEL: ClassVar[Label] = Label("IMU", "IMU sample", "IMU samples", "the inertial data", colour=(235, 80, 80))
 
-    gyro: Array = _axes("gyro_{}_rad_s")
-    accel: Array = _axes("accel_{}_m_s2")
+    gyro: Array = axes("gyro_{}_rad_s")
+    accel: Array = axes("accel_{}_m_s2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,10 +27,11 @@ class GnssFix(Positioned):
     """Position fixes with 1-sigma (n, 3) m; optional velocity (n, 3) m/s in nav axes."""
 
     NAME: ClassVar[str] = "gnss"
+    LABEL: ClassVar[Label] = Label("GNSS", "GNSS fix", "GNSS fixes", colour=(80, 200, 120))
 
-    velocity: Array | None = _columns("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
-    sigma_velocity: Array | None = _columns("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
-    fix_type: Array | None = _columns("fix_type", optional=True, kind="int")
+    velocity: Array | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
+    sigma_velocity: Array | None = quantity("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
+    fix_type: Array | None = quantity("fix_type", optional=True, kind="int")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,9 +39,10 @@ class ControlPoint(Positioned):
     """Surveyed points the sensor head stood on."""
 
     NAME: ClassVar[str] = "control"
+    LABEL: ClassVar[Label] = Label("Control points", "control point", "control points", colour=(255, 130, 200))
 
-    point_id: Array = _columns("point_id", kind="text")
-    sensor: Array | None = _columns("sensor", optional=True, kind="text")
+    point_id: Array = quantity("point_id", kind="text")
+    sensor: Array | None = quantity("sensor", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,11 +50,12 @@ class PoseFix(Positioned):
     """Position or pose fixes from elsewhere (image recognition, total station); `quat` (n, 4) w x y z of nav_R_body."""
 
     NAME: ClassVar[str] = "pose_fixes"
+    LABEL: ClassVar[Label] = Label("Pose fixes", "pose fix", "pose fixes", colour=(60, 210, 210))
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    quat: Array | None = _columns("qw", "qx", "qy", "qz", optional=True, nan=True)
-    sigma_rot: Array | None = _axes("sigma_{}_rad", "enu", optional=True, nan=True)
-    source: Array | None = _columns("source", optional=True, kind="text")
+    quat: Array | None = quantity("qw", "qx", "qy", "qz", optional=True, nan=True)
+    sigma_rot: Array | None = axes("sigma_{}_rad", "enu", optional=True, nan=True)
+    source: Array | None = quantity("source", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,10 +63,12 @@ class StaticPeriod(Stream):
     """Listed standstills: from t_ns to t_end_ns, residual speed sigma m/s."""
 
     NAME: ClassVar[str] = "static"
+    LABEL: ClassVar[Label] = Label("Standstills", "standstill", "standstills")
+    AIDING: ClassVar[bool] = True
 
-    t_end_ns: NDArray[np.int64] = _columns("t_end_ns", kind="int")
-    sigma_v: Array | None = _columns("sigma_v_m_s", optional=True)
-    source: Array | None = _columns("source", optional=True, kind="text")
+    t_end_ns: NDArray[np.int64] = quantity("t_end_ns", kind="int")
+    sigma_v: Array | None = quantity("sigma_v_m_s", optional=True)
+    source: Array | None = quantity("source", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,8 +76,10 @@ class Magnetometer(Stream):
     """Magnetic flux density (n, 3) uT, body axes."""
 
     NAME: ClassVar[str] = "magnetometer"
+    LABEL: ClassVar[Label] = Label("Magnetometer", "magnetometer sample", "magnetometer samples", "the magnetometer")
+    AIDING: ClassVar[bool] = True
 
-    field_ut: Array = _axes("mag_{}_ut")
+    field_ut: Array = axes("mag_{}_ut")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,8 +87,10 @@ class Barometer(Stream):
     """Air pressure (n,) hPa."""
 
     NAME: ClassVar[str] = "barometer"
+    LABEL: ClassVar[Label] = Label("Barometer", "pressure sample", "pressure samples", "the barometer")
+    AIDING: ClassVar[bool] = True
 
-    pressure_hpa: Array = _columns("pressure_hpa")
+    pressure_hpa: Array = quantity("pressure_hpa")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +98,9 @@ class Temperature(Stream):
     """Sensor temperature (n,) deg C."""
 
     NAME: ClassVar[str] = "temperature"
+    LABEL: ClassVar[Label] = Label("Temperature", "temperature sample", "temperature samples")
 
-    temperature_c: Array = _columns("temperature_c")
+    temperature_c: Array = quantity("temperature_c")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,9 +108,11 @@ class Velocity(Stream):
     """Velocity (n, 3) m/s in body axes."""
 
     NAME: ClassVar[str] = "velocity"
+    LABEL: ClassVar[Label] = Label("Velocity", "velocity", "velocities", "the measured velocities")
+    AIDING: ClassVar[bool] = True
 
-    velocity: Array = _axes("v_{}_m_s")
-    sigma: Array | None = _axes("sigma_v{}_m_s", optional=True)
+    velocity: Array = axes("v_{}_m_s")
+    sigma: Array | None = axes("sigma_v{}_m_s", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,9 +120,11 @@ class WheelSpeed(Stream):
     """Wheel speed (n,) m/s along the vehicle's forward axis."""
 
     NAME: ClassVar[str] = "wheel"
+    LABEL: ClassVar[Label] = Label("Wheel speed", "wheel speed", "wheel speeds", "the wheel")
+    AIDING: ClassVar[bool] = True
 
-    speed: Array = _columns("speed_m_s")
-    sigma: Array | None = _columns("sigma_m_s", optional=True)
+    speed: Array = quantity("speed_m_s")
+    sigma: Array | None = quantity("sigma_m_s", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,13 +132,14 @@ class Images(Stream):
     """One row an image; files lie in the session's images/ folder."""
 
     NAME: ClassVar[str] = "images"
+    LABEL: ClassVar[Label] = Label("Images", "image", "images")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id: Array = _columns("image_id", kind="int")
-    file: Array = _columns("file", kind="text")
-    camera: Array = _columns("camera", kind="text")
-    exposure_ns: Array | None = _columns("exposure_ns", optional=True, kind="int")
-    readout_ns: Array | None = _columns("readout_ns", optional=True, kind="int")
+    image_id: Array = quantity("image_id", kind="int")
+    file: Array = quantity("file", kind="text")
+    camera: Array = quantity("camera", kind="text")
+    exposure_ns: Array | None = quantity("exposure_ns", optional=True, kind="int")
+    readout_ns: Array | None = quantity("readout_ns", optional=True, kind="int")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,12 +147,13 @@ class Tracks(Stream):
     """Feature observations; `xy_n` (n, 2) undistorted normalised image coordinates."""
 
     NAME: ClassVar[str] = "tracks"
+    LABEL: ClassVar[Label] = Label("Tracked points", "tracked point", "tracked points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id: Array = _columns("image_id", kind="int")
-    track_id: Array = _columns("track_id", kind="int")
-    xy_n: Array = _columns("x_n", "y_n")
-    xy_px: Array | None = _columns("x_px", "y_px", optional=True)
+    image_id: Array = quantity("image_id", kind="int")
+    track_id: Array = quantity("track_id", kind="int")
+    xy_n: Array = quantity("x_n", "y_n")
+    xy_px: Array | None = quantity("x_px", "y_px", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -326,14 +161,15 @@ class Matches(Stream):
     """Matched points of two images; normalised coordinates (n, 2) each."""
 
     NAME: ClassVar[str] = "matches"
+    LABEL: ClassVar[Label] = Label("Matched points", "matched point", "matched points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id_0: Array = _columns("image_id_0", kind="int")
-    image_id_1: Array = _columns("image_id_1", kind="int")
-    t_1_ns: Array = _columns("t_ns_1", kind="int")
-    xy0_n: Array = _columns("x0_n", "y0_n")
-    xy1_n: Array = _columns("x1_n", "y1_n")
-    score: Array | None = _columns("score", optional=True)
+    image_id_0: Array = quantity("image_id_0", kind="int")
+    image_id_1: Array = quantity("image_id_1", kind="int")
+    t_1_ns: Array = quantity("t_ns_1", kind="int")
+    xy0_n: Array = quantity("x0_n", "y0_n")
+    xy1_n: Array = quantity("x1_n", "y1_n")
+    score: Array | None = quantity("score", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,34 +177,49 @@ class Reference(Stream):
     """A reference trajectory in nav: position m, and where known attitude, velocity, biases and sigmas."""
 
     NAME: ClassVar[str] = "reference"
+    LABEL: ClassVar[Label] = Label("Reference", "reference position", "reference positions")
 
-    enu: Array = _columns(*_ENU)
-    quat: Array | None = _columns("qw", "qx", "qy", "qz", optional=True)
-    velocity: Array | None = _columns("ve_m_s", "vn_m_s", "vu_m_s", optional=True)
-    accel_bias: Array | None = _axes("accel_bias_{}_m_s2", optional=True)
-    gyro_bias: Array | None = _axes("gyro_bias_{}_rad_s", optional=True)
-    sigma: Array | None = _axes("sigma_{}_m", "enu", optional=True, nan=True)
+    enu: Array = quantity(*ENU)
+    quat: Array | None = quantity("qw", "qx", "qy", "qz", optional=True)
+    velocity: Array | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True)
+    accel_bias: Array | None = axes("accel_bias_{}_m_s2", optional=True)
+    gyro_bias: Array | None = axes("gyro_bias_{}_rad_s", optional=True)
+    sigma: Array | None = axes("sigma_{}_m", "enu", optional=True, nan=True)
 
 
-# Streams that tell a position by themselves. Their rows make keyframes.
-ABSOLUTE = ("gnss", "control", "pose_fixes")
+@dataclass(frozen=True, kw_only=True)
+class Streams:
+    """The streams that a session may hold, each optional. A new kind of stream adds its field here."""
 
-STREAMS: dict[str, type[Stream]] = {
-    cls.NAME: cls
-    for cls in (
-        Imu,
-        GnssFix,
-        ControlPoint,
-        StaticPeriod,
-        PoseFix,
-        Magnetometer,
-        Barometer,
-        Temperature,
-        Velocity,
-        WheelSpeed,
-        Images,
-        Tracks,
-        Matches,
-        Reference,
-    )
-}
+    imu: Imu | None = None
+    gnss: GnssFix | None = None
+    control: ControlPoint | None = None
+    static: StaticPeriod | None = None
+    pose_fixes: PoseFix | None = None
+    magnetometer: Magnetometer | None = None
+    barometer: Barometer | None = None
+    temperature: Temperature | None = None
+    velocity: Velocity | None = None
+    wheel: WheelSpeed | None = None
+    images: Images | None = None
+    tracks: Tracks | None = None
+    matches: Matches | None = None
+    reference: Reference | None = None
+
+    def streams(self) -> dict[str, Stream]:
+        """The streams that are there, by name."""
+        return {name: stream for name in STREAMS if (stream := getattr(self, name)) is not None}
+
+    def absolute(self) -> dict[str, Stream]:
+        """The streams that tie the trajectory to places, by name."""
+        return {name: stream for name, stream in self.streams().items() if stream.ABSOLUTE}
+
+    def positions(self) -> dict[str, Positioned]:
+        """The streams of positions, by name."""
+        return {name: stream for name, stream in self.streams().items() if isinstance(stream, Positioned)}
+
+
+# Every kind of stream, by name.
+STREAMS: dict[str, type[Stream]] = {name: get_args(kind)[0] for name, kind in get_type_hints(Streams).items()}
+ABSOLUTE = tuple(name for name, kind in STREAMS.items() if kind.ABSOLUTE)
+POSITIONS = tuple(name for name, kind in STREAMS.items() if issubclass(kind, Positioned))

@@ -25,7 +25,8 @@ from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
 from smartnav_graph.session.session import Device, Mount, Session
-from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod
 from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import CameraModel
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel

@@ -33,7 +33,7 @@ class SolveConfig:
 
     def __post_init__(self) -> None:
         if not (self.max_iterations > 0 and self.tolerance > 0 and self.step_tolerance > 0):
-            raise ConfigError("config [solve]", "a value <= 0", "> 0")
+            raise ConfigError("config [solver]", "a value <= 0", "> 0")
 
 
 # Iterations in a row that no longer lower the cost end the search even where a state that nothing holds still moves.

@@ -20,7 +20,7 @@ from smartnav_graph.core.files import replacing, write_table
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Stream
+from smartnav_graph.session.stream import Stream
 from smartnav_graph.vision import images
 from smartnav_graph.vision.front_end import Found, FrontEndConfig, asked, find
 from smartnav_graph.vision.front_end_report import FrontEndReport

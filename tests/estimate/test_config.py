@@ -53,7 +53,7 @@ def test_every_section_is_a_frozen_room():
         ({"initialise": {"stretch_s": 0.0}}, ("config [initialise]: stretch_s = 0.0",)),
         ({"initialise": {"starts": 0}}, ("starts = 0",)),
         ({"batch": {"settle_s": -1.0}}, ("config [batch]",)),
-        ({"solve": {"tolerance": 0.0}}, ("config [solve]",)),
+        ({"solver": {"tolerance": 0.0}}, ("config [solver]",)),
         ({"replay": {"smoother": "ekf"}}, ("--smoother: 'ekf'; expected fixed-lag or isam2",)),
         ({"replay": {"lag_s": 0.0}}, ("config [replay]",)),
         ({"run": {"vehicle": "ship"}}, ("--vehicle: 'ship'; expected one of none, car, trolley, foot",)),

@@ -31,7 +31,7 @@ def configured(smoother: str, **options) -> Config:
 def build_steps(problem):
     """Steps of a problem, built once: preintegration depends on the bias it is made at."""
     initial = initialise(problem)
-    maker = Batch(problem.config.batch, problem.config.solve, None, problem.session.t0_ns)
+    maker = Batch(problem.config.batch, problem.config.solver, None, problem.session.t0_ns)
     for window in problem.windows:
         update = build_update(
             window, maker.latest(), [initial.prior, *problem.builders], PassState(), problem.session.t0_ns

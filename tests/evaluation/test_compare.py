@@ -80,9 +80,9 @@ def test_rejected_rows_that_only_one_run_has():
     def summary(**rows):
         return {"rejections": [{"sensor": name, "row": row} for name, numbers in rows.items() for row in numbers]}
 
-    found = rejected_sets(summary(gnss=[1, 2, 3], coplanarity=[7]), summary(gnss=[3, 2, 9]))
+    found = rejected_sets(summary(gnss=[1, 2, 3], image_pairs=[7]), summary(gnss=[3, 2, 9]))
     assert found["gnss"] == {"both": 2, "only_first": [1], "only_second": [9]}
-    assert found["coplanarity"] == {"both": 0, "only_first": [7], "only_second": []}
+    assert found["image_pairs"] == {"both": 0, "only_first": [7], "only_second": []}
     assert rejected_sets({}, {}) == {}
 
 

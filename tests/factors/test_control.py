@@ -8,7 +8,7 @@ from exact import LEVER, assemble, record
 
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors import BUILDERS
+from smartnav_graph.factors import FACTORS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.graph.pass_state import PassState
@@ -19,7 +19,7 @@ from smartnav_graph.session.streams import ControlPoint
 
 def made(session, **config):
     context = FactorContext(session, Calibration(), (), "none", Config(control=ControlConfig(**config)))
-    return BUILDERS["control"](context)
+    return FACTORS["control"].build(context)
 
 
 def points(**sigma) -> ControlPoint:

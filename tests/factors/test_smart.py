@@ -140,7 +140,7 @@ def test_tracks_join_once_they_are_judged(problem):
     builder.verdict[::2] = 0 * builder.verdict[::2] + 1
     some = steps(problem, builder)
     assert sum(len(step.factors) for step in some) == (builder.verdict == IN_USE).sum()
-    coplanarity = next(b for b in problem.builders if b.name == "coplanarity")
+    coplanarity = next(b for b in problem.builders if b.name == "image_pairs")
     assert not any(step.blocks for step in steps(problem, coplanarity))
 
 

@@ -12,7 +12,7 @@ from smartnav_graph.core.frames import body_R_vehicle
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors.vehicle import MOUNT_SIZE, NonHolonomic, VehicleBuilder, VehicleConfig, recent
 from smartnav_graph.graph.pass_state import PassState
-from smartnav_graph.graph.states import key
+from smartnav_graph.graph.states import key, session_key
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import VEHICLE_CLASSES
@@ -131,7 +131,7 @@ def test_a_row_holds_rate_and_force_of_the_last_moments_without_bias():
     noise = VEHICLE_CLASSES["car"]
     rate = [0.0, 0.0, np.arange(95, 100).mean() / 100 - 0.1]
     np.testing.assert_allclose(block.data[0], [*rate, 1.5, 0.0, 9.8, noise.lateral_sigma, noise.vertical_sigma])
-    assert block.keys == [(key("X", 3), key("V", 3), key("M", 6))]
+    assert block.keys == [(key("X", 3), key("V", 3), session_key("M", "vehicle"))]
 
 
 def test_noise_found_from_the_data_scales_each_row():

@@ -10,7 +10,7 @@ import pytest
 
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
-from smartnav_graph.graph.states import KEYFRAME_LETTERS, SENSORS, STATES, SessionState, State, key
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, SessionState, State, key, session_key
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate, build_update
 from smartnav_graph.graph.windows import Window
 
@@ -62,7 +62,7 @@ CLOCK = SessionState("T", "gnss", "gnss_time_offset_s", np.zeros(1), np.array([0
 
 def test_a_session_state_has_one_key_and_may_be_held():
     update = GraphUpdate(4, NS, 1.0)
-    assert update.use(CLOCK) == update.use(CLOCK) == CLOCK.key == key("T", SENSORS.index("gnss"))
+    assert update.use(CLOCK) == update.use(CLOCK) == CLOCK.key == session_key("T", "gnss")
     update.hold({"something_else": np.ones(1)})
     assert list(update.session) == [CLOCK.key] and not update.held
     update.hold({"gnss_time_offset_s": np.array([0.06])})

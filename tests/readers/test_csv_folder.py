@@ -11,7 +11,8 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.session.folder import load, save
 from smartnav_graph.session.session import Device, Session
-from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference
 
 T = np.array([1403715273262142976, 1403715273267142912, 1403715273272142976])
 

@@ -20,7 +20,8 @@ from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration
 from smartnav_graph.session.folder import load, save
 from smartnav_graph.session.session import Device, Mount, Session
-from smartnav_graph.session.streams import STREAMS, GnssFix, Imu, Positioned
+from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.streams import STREAMS, GnssFix, Imu
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
 

@@ -19,7 +19,7 @@ from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.graph.pass_state import PassState
-from smartnav_graph.graph.states import SENSORS, key
+from smartnav_graph.graph.states import key, session_key
 from smartnav_graph.graph.update import FactorBatch, build_update
 from smartnav_graph.simulation import motions
 from smartnav_graph.smoothers import fixed_lag, incremental
@@ -29,7 +29,7 @@ from smartnav_graph.smoothers.minimise import SolveConfig
 
 FINE = SolveConfig(max_iterations=100, tolerance=1e-14, step_tolerance=1e-9)
 ALL = PassState(stage=1)
-T, L = (key(letter, SENSORS.index("gnss")) for letter in "TL")
+T, L = (session_key(letter, "gnss") for letter in "TL")
 DELAY_S = 0.06
 
 

@@ -40,7 +40,7 @@ def seen(room):
 
 
 def test_images_hold_what_inertial_data_lose(room, seen):
-    alone = smooth(room, options(coplanarity={"enabled": False}))
+    alone = smooth(room, options(image_pairs={"enabled": False}))
     without, (metres, degrees) = errors(alone.solution, room.reference), errors(seen.solution, room.reference)
     assert without[0] > 5.0  # m: half a minute of a phone's accelerometer
     assert metres < 0.05 and degrees < 0.5
@@ -59,12 +59,12 @@ def test_the_covariance_is_honest(room, seen):
 def test_the_account_of_pairs_and_matches_is_complete(room, seen):
     summary = seen.summary
     pairs = summary["image_pairs"]
-    builder = next(b for b in seen.problem.builders if b.name == "coplanarity")
+    builder = next(b for b in seen.problem.builders if b.name == "image_pairs")
     assert sum(pairs.values()) == len(builder.pairs)
-    assert summary["factors"]["coplanarity"] == pairs[REASONS[IN_USE]] + pairs[REASONS[CONTRARY]]
-    assert summary["chi2_per_dof"]["coplanarity"] == pytest.approx(1.0, abs=0.3)
+    assert summary["factors"]["image_pairs"] == pairs[REASONS[IN_USE]] + pairs[REASONS[CONTRARY]]
+    assert summary["chi2_per_dof"]["image_pairs"] == pytest.approx(1.0, abs=0.3)
     assert pairs[REASONS[IN_USE]] > 200
-    inside = seen.solution.residuals.of("coplanarity")
+    inside = seen.solution.residuals.of("image_pairs")
     assert (inside & seen.solution.residuals.used).sum() > 20 * pairs[REASONS[IN_USE]]
 
 
@@ -85,7 +85,7 @@ def test_a_replay_holds_on_to_images_too(room, smoother):
 def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     """All tracks of one image are off by 17 px: the pairs with it contradict the way, whatever pose they would fit."""
     tracks = room.tracks
-    images = next(b for b in seen.problem.builders if b.name == "coplanarity").pairs.t_ns
+    images = next(b for b in seen.problem.builders if b.name == "image_pairs").pairs.t_ns
     one = images[len(images) // 2]
     bad = tracks.t_ns == one
     slipped = replace(tracks, xy_n=tracks.xy_n + np.where(bad[:, None], [17 / 575, 0.0], 0.0), xy_px=None)
@@ -93,7 +93,7 @@ def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     metres, degrees = errors(run.solution, room.reference)
     clean = errors(seen.solution, room.reference)
     assert metres < clean[0] + 0.02 and degrees < clean[1] + 0.1
-    builder = next(b for b in run.problem.builders if b.name == "coplanarity")
+    builder = next(b for b in run.problem.builders if b.name == "image_pairs")
     touched = (builder.pairs.t_ns[builder.pairs.images] == one).any(axis=1)
     assert touched.sum() == 8 and not (builder.verdict[touched] == IN_USE).any()
 
@@ -102,8 +102,8 @@ def test_images_of_something_else_are_refused(room):
     """Tracks that have nothing to do with the motion: refused and told, and the result is that without images."""
     rng = np.random.default_rng(0)
     noise = room.replace(tracks=replace(room.tracks, xy_n=rng.uniform(-0.5, 0.5, room.tracks.xy_n.shape), xy_px=None))
-    run, alone = smooth(noise, options()), smooth(room, options(coplanarity={"enabled": False}))
-    assert any("coplanarity: refused" in text for text in run.summary["warnings"])
+    run, alone = smooth(noise, options()), smooth(room, options(image_pairs={"enabled": False}))
+    assert any("image_pairs: refused" in text for text in run.summary["warnings"])
     wrong, without = errors(run.solution, room.reference), errors(alone.solution, room.reference)
     assert wrong[0] <= 1.1 * without[0] and wrong[1] <= 1.1 * without[1]
 
@@ -118,7 +118,7 @@ def test_camera_states_find_what_is_wrong(room):
         sensors={**room.sensors, name: Mount(mount.body_t, tuple(map(tuple, R.tolist())))},
         tracks=replace(room.tracks, t_ns=room.tracks.t_ns - 15 * NS // 1000),
     )
-    run = smooth(wrong, options(coplanarity={"boresight_sigma_deg": 1.0, "time_offset_sigma": 0.05}))
+    run = smooth(wrong, options(image_pairs={"boresight_sigma_deg": 1.0, "time_offset_sigma": 0.05}))
     states = run.summary["states"]
     assert states["images_time_offset_s"]["value"] == pytest.approx(0.015, abs=0.002)
     found = np.array(states["camera_boresight_rad"]["value"])

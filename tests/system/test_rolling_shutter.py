@@ -21,7 +21,7 @@ ROLLING = replace(ROOM, camera=replace(ROOM.camera, camera=replace(ROOM.camera.c
 
 
 def options(row_time=True, **sections):
-    return config.from_dict({"coplanarity": {"row_time": row_time}, **sections}, "test")
+    return config.from_dict({"image_pairs": {"row_time": row_time}, **sections}, "test")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def room():
 def misses(session, row_time):
     """Median and largest residual, px, of all matches at the true motion."""
     problem = prepare(session, options(row_time))
-    builder = next(b for b in problem.builders if b.name == "coplanarity")
+    builder = next(b for b in problem.builders if b.name == "image_pairs")
     truth = session.reference
     at = np.searchsorted(truth.t_ns, builder.image_ns)
     R = Rotation.from_quat(truth.quat[at], scalar_first=True).as_matrix()
@@ -79,7 +79,7 @@ def test_a_replay_has_row_times_too(room):
 def test_the_readout_is_that_of_the_images_or_of_the_calibration(room):
     def readout(session, row_time=True):
         builders = prepare(session, options(row_time)).builders
-        return next(b for b in builders if b.name == "coplanarity").camera_model.readout_s
+        return next(b for b in builders if b.name == "image_pairs").camera_model.readout_s
 
     assert readout(room) == READOUT_S
     assert readout(room, row_time=False) == 0.0

@@ -53,7 +53,7 @@ def test_the_account_is_complete(run):
     builder = next(b for b in run.problem.builders if b.name == "smart")
     assert sum(summary["tracks"].values()) == len(builder.sightings)
     assert summary["factors"]["smart"] == summary["tracks"][REASONS[IN_USE]] > 300
-    assert "coplanarity" not in summary["factors"] and "image_pairs" not in summary
+    assert "image_pairs" not in summary["factors"] and "image_pairs" not in summary
     assert summary["chi2_per_dof"]["smart"] == pytest.approx(1.0, abs=0.1)
     assert 0.7 < summary["chi2_per_dof"]["overall"] < 1.3
     residuals = run.solution.residuals
@@ -94,14 +94,14 @@ def test_tracks_of_something_else_are_refused(room):
     rng = np.random.default_rng(0)
     noise = room.replace(tracks=replace(room.tracks, xy_n=rng.uniform(-0.5, 0.5, room.tracks.xy_n.shape), xy_px=None))
     found = smooth(noise, options())
-    alone = smooth(room, config.from_dict({"coplanarity": {"enabled": False}}, "test"))
+    alone = smooth(room, config.from_dict({"image_pairs": {"enabled": False}}, "test"))
     assert any("smart: tracks are refused as the image pairs are" in text for text in found.summary["warnings"])
     assert errors(found.solution, room.reference)[0] <= 1.1 * errors(alone.solution, room.reference)[0]
 
 
 def test_without_pairs_tracks_are_judged_by_the_rest_alone(room):
     """Half a minute of a phone's accelerometer is too poor: refused, and told."""
-    found = smooth(room, options(coplanarity={"enabled": False}))
+    found = smooth(room, options(image_pairs={"enabled": False}))
     assert any("smart: refused, only" in text for text in found.summary["warnings"])
     assert "smart" not in found.summary["factors"] and found.summary["rejected"].get("smart") is None
 
@@ -122,7 +122,7 @@ def test_images_that_share_a_keyframe_count_once(room):
     twice = {name: np.concatenate([column, column])[both] for name, column in tracks.columns().items()}
     twice["t_ns"] = np.concatenate([tracks.t_ns, tracks.t_ns + 50_000])[both]
     doubled = room.replace(tracks=type(tracks).from_columns(twice))
-    found = smooth(doubled, options(coplanarity={"rate_hz": 1e6, "spans": [2, 8]}, run={"end_s": 9.0}))
+    found = smooth(doubled, options(image_pairs={"rate_hz": 1e6, "spans": [2, 8]}, run={"end_s": 9.0}))
     assert found.summary["factors"]["smart"] > 50
     builder = next(b for b in found.problem.builders if b.name == "smart")
     used = builder.use & (builder.verdict == IN_USE)[:, None]
@@ -144,7 +144,7 @@ def solved(room):
 def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
     problem, estimate, pass_state = solved
     builder = replace(next(b for b in problem.builders if b.name == "smart"))
-    pairs = next(b for b in problem.builders if b.name == "coplanarity")
+    pairs = next(b for b in problem.builders if b.name == "image_pairs")
     assert pairs.replaced(pass_state) and "images_time_offset_s" in pass_state.fixed_states
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, builder.sightings.xy.shape)
     builder.sightings = replace(builder.sightings, xy=xy)

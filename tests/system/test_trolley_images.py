@@ -19,7 +19,7 @@ TROLLEY = SCENARIOS["trolley-20min"]
 @pytest.mark.parametrize("seed", range(3))
 def test_better_by_two_and_never_worse_for_a_camera_that_is_not_known(seed):
     session = TROLLEY(seed)
-    blind = sn.Config(coplanarity=CoplanarityConfig(enabled=False))
+    blind = sn.Config(image_pairs=CoplanarityConfig(enabled=False))
     without = rms(session, sn.run(session, blind, rate="imu").solution)
     metres, degrees = rms(session, sn.run(session, rate="imu").solution)
     assert metres < without[0] / 2 and degrees < without[1] / 2

@@ -114,7 +114,7 @@ def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
 
 def _absolute_positions(problem: Problem) -> tuple[Times, Floats, list[tuple[str, int]], Times]:
     """Stamps, nav positions, sensor and row, and arrival of all absolute measurements, in time order."""
-    streams = problem.session.absolute()
+    streams = problem.session.positions()
     if not streams:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), [], np.zeros(0, dtype=np.int64)
     t = np.concatenate([stream.t_ns for stream in streams.values()])

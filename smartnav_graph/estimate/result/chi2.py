@@ -20,7 +20,7 @@ from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
 # Redundancy below which a sum of squares tells nothing of a sensor's noise.
 LEAST_REDUNDANCY = 1.0
 # Image pairs: matches within their gate count in full, their loss would make the sum too small.
-UNWEIGHTED = "coplanarity"
+UNWEIGHTED = "image_pairs"
 
 
 @dataclass(frozen=True)

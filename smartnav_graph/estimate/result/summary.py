@@ -18,7 +18,6 @@ from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
 from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight import track_outliers
-from smartnav_graph.estimate.reweight.constraint_noise import noise_groups
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
@@ -141,9 +140,9 @@ def summarise(
 def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outliers.Account | None) -> dict[str, int]:
     """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the way, and matches and
     observations of those that do not."""
-    found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("coplanarity", "matches")}
+    found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("image_pairs", "matches")}
     if seen is not None:
-        found |= {"coplanarity": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
+        found |= {"image_pairs": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
     if tracks is not None and tracks.in_force:
         found |= {SMART: tracks.contrary, "tracks": tracks.outliers}
     return found
@@ -199,7 +198,7 @@ def _inertial_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[s
 
 def _row_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
     """Sigmas of the constraints' rows."""
-    groups = [item for builder in problem.builders for item in noise_groups(builder).items()]
+    groups = [item for builder in problem.builders for item in builder.noise_groups.items()]
     return {
         f"{group}_sigma": {
             "value": float(f"{sigma * pass_state.scale(group):.4g}"),

@@ -14,7 +14,7 @@ Source: Koch (1999), Parameter estimation, 3.6; Priestley (1981), Spectral Analy
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -76,13 +76,7 @@ def row_scales(builders: Iterable[Builder], estimate: Estimate, pass_state: Pass
     """Scales on the class sigmas of every builder that names its `noise_groups`."""
     found: dict[str, float] = {}
     for builder in builders:
-        groups = noise_groups(builder)
+        groups = builder.noise_groups
         for stack in estimate.stacks(builder.name) if groups else ():
             found |= _scales(stack, groups, estimate, pass_state)
     return found
-
-
-def noise_groups(builder: Builder) -> Mapping[str, float]:
-    """Class sigma by group, one an axis of the builder's residual; none where its sigma came with the data."""
-    groups: Mapping[str, float] = getattr(builder, "noise_groups", {})
-    return groups

@@ -161,6 +161,6 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
     if kept >= LEAST_PAIRS * asked:
         return ""
     return (
-        f"coplanarity: refused, only {kept} of {asked} image pairs agree with the solution without images: too "
+        f"image_pairs: refused, only {kept} of {asked} image pairs agree with the solution without images: too "
         "poor to judge them by; add fixes, control points or standstills"
     )

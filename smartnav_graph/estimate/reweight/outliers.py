@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +113,7 @@ def verdicts(
         if isinstance(builder, PositionBuilder):
             if builder.gated and builder.name in found:
                 result.append(_position_verdict(builder, found[builder.name], pass_state))
-        elif getattr(builder, "gate_probability", None):
+        elif builder.gate_probability is not None:
             result += _block_verdict(builder, estimate)
     return result
 
@@ -129,7 +128,7 @@ def _position_verdict(builder: PositionBuilder, found: FixResiduals, pass_state:
     return Verdict(builder.name, found.rows, square, 3, limit, builder.config.loss == "gnc")
 
 
-def _block_verdict(builder: Any, estimate: Estimate) -> list[Verdict]:
+def _block_verdict(builder: Builder, estimate: Estimate) -> list[Verdict]:
     stacks = estimate.stacks(builder.name)
     if not stacks:
         return []

@@ -126,7 +126,7 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
         return ""
     return (
         f"smart: refused, only {kept} of {asked} tracks agree with the solution without them: too poor to judge them "
-        "by; leave coplanarity on, or add fixes, control points or standstills"
+        "by; leave image_pairs on, or add fixes, control points or standstills"
     )
 
 

@@ -150,7 +150,7 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     positions = position_builders(builders)
     wandering = frozenset(b.name for b in positions if b.wanders(pass_state))
     if pass_state.stage < LAST_STAGE:
-        later = any(b.stage == LAST_STAGE or (hasattr(b, "grows") and b.grows(pass_state)) for b in builders)
+        later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=wandering) if later else pass_state
     blind = {
         state.name: state.prior_mean

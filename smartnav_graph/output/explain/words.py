@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.evaluation.influence import CALIBRATION
+from smartnav_graph.factors import label_of
 from smartnav_graph.output.explain.figures import (
     DIRECTION,
     HEIGHT,
@@ -23,26 +25,7 @@ from smartnav_graph.output.explain.figures import (
 )
 from smartnav_graph.output.explain.nearby import Nearby, Stretch
 
-WORDS = {
-    "imu": "the inertial data",
-    "gnss": "the GNSS fixes",
-    "control": "the control points",
-    "pose_fixes": "the pose fixes",
-    "pose_attitude": "the attitude of the pose fixes",
-    "static": "the standstills",
-    "gnss_velocity": "the GNSS velocities",
-    "velocity": "the measured velocities",
-    "vehicle": "the vehicle constraint",
-    "wheel": "the wheel",
-    "magnetometer": "the magnetometer",
-    "gravity": "gravity as the level",
-    "barometer": "the barometer",
-    "steps": "the steps",
-    "coplanarity": "the image pairs",
-    "smart": "the image tracks",
-    "prior": "the first state (as found or assumed)",
-    "calibration": "the calibration (of clocks, lever arms, mounts)",
-}
+CALIBRATED = "the calibration (of clocks, lever arms, mounts)"
 # A share below this is not told in a sentence.
 SPOKEN = 0.1
 # What stands at the instant itself is told from this share on.
@@ -55,7 +38,7 @@ WINDS = ("east", "north-east", "north", "north-west", "west", "south-west", "sou
 
 def words(source: str) -> str:
     """A source as people call it."""
-    return WORDS.get(source, source)
+    return CALIBRATED if source == CALIBRATION else label_of(source).as_source
 
 
 def sentences(found: Explanation, near: Nearby) -> list[str]:

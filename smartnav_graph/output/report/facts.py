@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from smartnav_graph.factors import label_of
 from smartnav_graph.output.report.text import (
     Row,
     Table,
@@ -25,33 +26,6 @@ from smartnav_graph.output.report.text import (
 
 Summary = Mapping[str, Any]
 
-SENSORS = {
-    "imu": ("IMU", "IMU sample", "IMU samples"),
-    "imu_bias": ("IMU bias walk", "bias step", "bias steps"),
-    "gnss": ("GNSS", "GNSS fix", "GNSS fixes"),
-    "control": ("Control points", "control point", "control points"),
-    "pose_fixes": ("Pose fixes", "pose fix", "pose fixes"),
-    "imu_straying": ("Straying in IMU holes", "straying", "strayings"),
-    "prior": ("Start", "prior", "priors"),
-    "rest": ("Rest at the start", "zero velocity", "zero velocities"),
-    "vehicle": ("Vehicle", "vehicle row", "vehicle rows"),
-    "steps": ("Steps", "stretch of steps", "stretches of steps"),
-    "gnss_wander": ("GNSS wander", "wander", "wanders"),
-    "gnss_velocity": ("GNSS velocity", "GNSS velocity", "GNSS velocities"),
-    "barometer_bias": ("Pressure drift", "drift", "drifts"),
-    "static": ("Standstills", "standstill", "standstills"),
-    "magnetometer": ("Magnetometer", "magnetometer sample", "magnetometer samples"),
-    "barometer": ("Barometer", "pressure sample", "pressure samples"),
-    "temperature": ("Temperature", "temperature sample", "temperature samples"),
-    "velocity": ("Velocity", "velocity", "velocities"),
-    "wheel": ("Wheel speed", "wheel speed", "wheel speeds"),
-    "images": ("Images", "image", "images"),
-    "tracks": ("Tracked points", "tracked point", "tracked points"),
-    "matches": ("Matched points", "matched point", "matched points"),
-    "coplanarity": ("Image pairs", "image pair", "image pairs"),
-    "smart": ("Tracks in space", "track", "tracks"),
-    "static_turn": ("Rests without turn", "rest without turn", "rests without turn"),
-}
 MOST_REJECTED = 0.25  # share of a sensor's rows that may be outliers
 HOLES = {"bridged": "bridged by interpolation", "missing": "no samples"}
 MODES = {
@@ -68,13 +42,13 @@ def room(summary: Summary, key: str) -> Mapping[str, Any]:
 
 
 def sensor_name(name: str) -> str:
-    return SENSORS[name][0] if name in SENSORS else capital(name.replace("_", " "))
+    return label_of(name).title
 
 
 def things(name: str, n: Any) -> str:
     """``3 GNSS fixes``."""
-    one, many = SENSORS[name][1:] if name in SENSORS else (f"{name} measurement", f"{name} measurements")
-    return plural(n, one, many)
+    label = label_of(name)
+    return plural(n, label.one, label.many)
 
 
 def gaps(summary: Summary) -> list[tuple[float, float, str]]:

@@ -14,13 +14,13 @@ from smartnav_graph.output.report.facts import Summary, room, sensor_name
 from smartnav_graph.output.report.svg import Axis, Plot
 from smartnav_graph.output.report.text import count
 from smartnav_graph.output.report.thin import thin_dots
-from smartnav_graph.output.report.usage import POSITIONS
+from smartnav_graph.session.streams import POSITIONS
 
 LANE_PX = 34
 BAR, OUT = (0.14, 0.44), (0.05, 0.53)  # shares of its lane that a bar and a rejected event fill, from below
 NARROWEST = 1 / 500  # of the whole width
 SINGLE = 150  # so many events are drawn one by one, more as stretches
-IMAGES = ("coplanarity", "smart")
+IMAGES = ("image_pairs", "smart")
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import nearest
 from smartnav_graph.graph.solution import POS, Residuals, Solution
 from smartnav_graph.output.report.svg import Axis, Plot, legend, round_step, ticked
-from smartnav_graph.output.report.text import count, fixed
+from smartnav_graph.output.report.text import capital, count, fixed
 from smartnav_graph.output.report.thin import thin_path
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Positioned
+from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.streams import STREAMS
 
-FIXES = ("gnss", "control", "pose_fixes")
 SHAPES = (1.25, 2.4)  # width / height of the map
 ELLIPSES = 30
 
@@ -28,9 +28,8 @@ def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, 
     Without residuals every fix inside the run counts as used.
     """
     found = {}
-    for name in FIXES:
-        stream = getattr(session, name)
-        if stream is None or not len(stream) or not len(solution):
+    for name, stream in session.positions().items():
+        if not len(stream) or not len(solution):
             continue
         inside = (stream.t_ns >= solution.t_ns[0]) & (stream.t_ns <= solution.t_ns[-1])
         if inside.any():
@@ -103,7 +102,6 @@ def _way(plot: Plot, xy: Floats, cls: str) -> None:
 def _fixes(
     plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]], states: Sequence[str]
 ) -> list[tuple[str, str]]:
-    names = {"gnss": "GNSS fix", "control": "Control point", "pose_fixes": "Pose fix"}
     words = {"used": "used", "unused": "withheld or not used", "rejected": "rejected"}
     entries = []
     for name, (xy, state) in fixes.items():
@@ -116,7 +114,9 @@ def _fixes(
                 cls = f"{'control' if name != 'gnss' and key == 'used' else f'fix-{key}'}"
                 plot.dots(rows[seen, 0], rows[seen, 1], cls)
                 outside = f", {count((~seen).sum())} off the map" if (~seen).any() else ""
-                entries.append((f"dots {cls}", f"{names[name]} {words[key]} ({count(len(rows))}{outside})"))
+                entries.append(
+                    (f"dots {cls}", f"{capital(STREAMS[name].LABEL.one)} {words[key]} ({count(len(rows))}{outside})")
+                )
     return entries
 
 

@@ -8,27 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from smartnav_graph.factors import label_of
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report.facts import Summary, chi2_by_sensor, room, sensor_name, things, withheld_counts
 from smartnav_graph.output.report.text import DASH, Row, Table, as_float, capital, count, metres, number, seconds
+from smartnav_graph.session.streams import POSITIONS
 
 SMALL = 0.3  # chi2 per degree of freedom of noise that is stated too large
 LOST_ROWS = 10  # fixes in a row that are no outliers any more
-POSITIONS = ("gnss", "control", "pose_fixes")
-# What no sensor measured, and what it means.
-ASSUMED = {
-    "prior": "how much is taken for granted of the first state",
-    "imu_bias": "the biases of the IMU drift, they do not jump",
-    "imu_straying": "how far the motion may have strayed there",
-    "rest": "the device did not move",
-    "static_turn": "the device did not turn while at rest",
-    "vehicle": "wheels do not slide sideways or leave the road",
-    "steps": "how long a walker's steps are, and where they lead",
-    "pace": "a person does not move fast",
-    "gravity": "the mean of the specific force points up",
-    "gnss_wander": "the errors of successive fixes are alike",
-    "barometer_bias": "the weather changes slowly",
-}
 FATES = {
     "in use": "in use",
     "outside the stretch": "outside the stretch that was solved",
@@ -45,7 +32,11 @@ def used_table(summary: Summary, recorded: Mapping[str, int]) -> Table:
     """
     factors, rejected, dropped = (room(summary, k) for k in ("factors", "rejected", "dropped"))
     withheld, chi2 = withheld_counts(summary), chi2_by_sensor(summary)
-    names = [n for n in dict.fromkeys([*recorded, *factors, *rejected, *withheld, *dropped, *chi2]) if n not in ASSUMED]
+    names = [
+        n
+        for n in dict.fromkeys([*recorded, *factors, *rejected, *withheld, *dropped, *chi2])
+        if not label_of(n).assumes
+    ]
     lost = {name: round(sum(as_float(n) or 0.0 for n in room(dropped, name).values())) for name in names}
     columns: list[tuple[str, list[str]]] = [
         ("Sensor", [sensor_name(name) for name in names]),
@@ -67,8 +58,8 @@ def assumed_table(summary: Summary) -> Table:
     factors = room(summary, "factors")
     rows = [
         Row([sensor_name(name), count(factors[name]), meaning], {"assumed": name, "used": factors[name]})
-        for name, meaning in ASSUMED.items()
-        if as_float(factors.get(name))
+        for name in factors
+        if (meaning := label_of(name).assumes) and as_float(factors[name])
     ]
     return Table(("Assumed besides", "Factors", "Meaning"), rows, frozenset({2}))
 
@@ -79,7 +70,7 @@ def why_lines(summary: Summary) -> list[str]:
         f"{capital(things(name, n))} rejected: farther from the solution than {'its' if n == 1 else 'their'} "
         "own uncertainty allows."
         for name, n in room(summary, "rejected").items()
-        if as_float(n) and name not in ("coplanarity", "smart")
+        if as_float(n) and name not in ("image_pairs", "smart")
     ]
     for stream, reasons in room(summary, "dropped").items():
         known = {reason: n for reason, n in room({"r": reasons}, "r").items() if as_float(n)}

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from smartnav_graph.factors import label_of
+
 AXES = [[235, 80, 80], [90, 200, 100], [90, 150, 255]]
 ESTIMATE = [90, 160, 255]
 CAUSAL = [225, 180, 20]
 REFERENCE = [150, 150, 150]
-FIX = [80, 200, 120]
+FIX, POSE_FIX, CONTROL = (list(label_of(name).colour) for name in ("gnss", "pose_fixes", "control"))
 REJECTED = [255, 60, 60]
 WITHHELD = [190, 130, 255]
-POSE_FIX = [60, 210, 210]
-CONTROL = [255, 130, 200]
 COVARIANCE = [255, 150, 40]
 VELOCITY = [120, 230, 120]
 BODY = [225, 70, 225]
@@ -25,21 +25,12 @@ WINDOW = [225, 70, 225]
 GRID = [128, 128, 128, 70]
 # States of the graph, by letter, and factors, by what they rest on.
 STATES = {"X": [90, 160, 255], "V": [120, 230, 120], "B": [255, 170, 60]}
-_BUILDERS = {
-    "imu": [235, 80, 80],
-    "imu_bias": [200, 110, 70],
-    "gnss": FIX,
-    "control": CONTROL,
-    "pose_fixes": POSE_FIX,
-    "coplanarity": CAUSAL,
-    "prior": REFERENCE,
-}
 MATCH, OUTLIER, UNUSED, NEUTRAL = [90, 220, 120], [255, 70, 70], [240, 180, 70], [150, 200, 255]
 
 
 def of_builder(name: str) -> list[int]:
     """The colour of a builder's factors."""
-    return _BUILDERS.get(name, [190, 130, 255])
+    return list(label_of(name).colour)
 
 
 GOOD, POOR, BAD, STILL = [60, 140, 80], [200, 130, 40], [210, 60, 60], [70, 110, 190]

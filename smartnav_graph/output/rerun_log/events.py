@@ -13,7 +13,7 @@ from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.timebase import NS, Gap, find_gaps, nearest, ns_from_seconds
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Stream
+from smartnav_graph.session.stream import Stream
 
 USED, REJECTED, WITHHELD = 0, 1, 2
 

@@ -254,6 +254,6 @@ def log_fixes(scene: Scene, events: Events) -> None:
         names, first = np.unique(session.control.point_id.astype(str), return_index=True)
         enu = session.nav_position(session.control)[first]
         scene.points("control", enu, colours.CONTROL, 5.0, [str(name) for name in names])
-    others = [stream for name, stream in session.absolute().items() if name != "gnss"]
+    others = [stream for name, stream in session.positions().items() if name != "gnss"]
     rejected = [session.nav_position(stream)[events.use[stream.NAME] == REJECTED] for stream in others]
     scene.points("rejected", np.concatenate([np.zeros((0, 3)), *rejected]), colours.REJECTED, 6.0)

@@ -11,7 +11,7 @@ from smartnav_graph.core.timebase import Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Stream
+from smartnav_graph.session.stream import Stream
 
 MOST_LINES_A_KIND = 200
 

@@ -17,7 +17,8 @@ from smartnav_graph.session.health import inertial, positions, sensors, streams
 from smartnav_graph.session.health.facts import AIDING, Facts, Finding
 from smartnav_graph.session.health.inertial import quiet_accel, tilt_errors
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import ABSOLUTE, Stream
+from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import ABSOLUTE
 
 __all__ = ["AIDING", "Finding", "Health", "StreamHealth", "inspect", "quiet_accel", "tilt_errors"]
 

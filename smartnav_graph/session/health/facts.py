@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS, Gap, interpolate
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import ABSOLUTE, Imu, Positioned
+from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.streams import STREAMS, Imu
 
-AIDING = (*ABSOLUTE, "static", "magnetometer", "barometer", "velocity", "wheel")
+AIDING = tuple(name for name, kind in STREAMS.items() if kind.AIDING)
 JUDGED = 10  # rows from which on a stream is judged
 CHORD_S = 4.0  # s, over which fixes tell a speed
 

@@ -12,7 +12,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats, thinned
 from smartnav_graph.session.health.units import odd_speed
-from smartnav_graph.session.streams import Positioned
+from smartnav_graph.session.stream import Positioned
 
 _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
 _FAR_M = 50_000.0  # two sensors of one session
@@ -77,7 +77,7 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
 
 def _geodetic(facts: Facts) -> dict[str, Floats]:
     """Latitude and longitude (deg) and height (n, 3) m of the streams that tell them."""
-    return {name: s.lla for name, s in facts.session.absolute().items() if len(s) and s.lla is not None}
+    return {name: s.lla for name, s in facts.session.positions().items() if len(s) and s.lla is not None}
 
 
 def _degrees_apart(one: Floats, other: Floats) -> float:

@@ -80,7 +80,7 @@ def test_a_fix_alone_beside_what_was_assumed(stored, tmp_path):
     Influence([*known, group("gnss", x, np.eye(6)[3:] / 3.0)], frames).write(tmp_path)
     found = explain(replace(stored, path=tmp_path), float(stored.solution.seconds[0]))
     assert told(found, "What is uncertain about the position").endswith("comes from the GNSS fixes (100%).")
-    assert "heading comes from the first state (as found or assumed) (100%)" in " ".join(found.sentences)
+    assert "heading comes from the prior on the initial state (100%)" in " ".join(found.sentences)
     assert "the heading, the tilt and the velocity would be lost" in told(found, "Without the first state")
     assert "known to 4.243 m" in told(found, "The position")  # 3 m on each of two axes
     assert told(found, "Measured at this very instant").startswith(

@@ -186,7 +186,7 @@ def summary(n: int = 470) -> dict[str, Any]:
         "duration_s": n - 1.0,
         "path_m": 4318.27,
         "keyframes": n,
-        "factors": {"imu": n - 1, "gnss": 231, "prior": 1, "vehicle": 460, "coplanarity": 60},
+        "factors": {"imu": n - 1, "gnss": 231, "prior": 1, "vehicle": 460, "image_pairs": 60},
         "used": {"gnss": 231},
         "standstills": {"count": 2, "total_s": 21.5, "at_rest_s": 14.0, "spans_s": [[148.0, 158.5], [300.0, 311.0]]},
         "image_pairs": {"in use": 60, "no baseline to speak of": 39, "contradicts the turn or the way": 1},

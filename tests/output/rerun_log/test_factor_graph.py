@@ -49,7 +49,7 @@ def test_what_lies_before_stands_together():
 
 
 def test_no_node_lies_on_another():
-    picture = factor_graph.picture_of([*FACTORS, ("coplanarity", [("X", 0), ("X", 1)])], first=0)
+    picture = factor_graph.picture_of([*FACTORS, ("image_pairs", [("X", 0), ("X", 1)])], first=0)
     assert len(set(picture.places)) == len(picture.places)
     assert len(set(picture.ids)) == len(picture.ids)
     assert {end for edge in picture.edges for end in edge} <= set(picture.ids)
@@ -68,6 +68,6 @@ def test_each_moment_shows_the_last_keyframes(tmp_path, monkeypatch):
 
 def test_places_do_not_hang_on_the_order_of_a_set():
     """States with the same index: the camera's clock and its attitude."""
-    factors = [("coplanarity", [("X", 0), ("T", 10), ("A", 10), ("L", 10)])]
-    labels = [label for label in factor_graph.picture_of(factors, first=0).labels if label != "coplanarity"]
+    factors = [("image_pairs", [("X", 0), ("T", 10), ("A", 10), ("L", 10)])]
+    labels = [label for label in factor_graph.picture_of(factors, first=0).labels if label != "image_pairs"]
     assert labels == ["pose 0", "mount rotation", "lever arm", "time offset"]

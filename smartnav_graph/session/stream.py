@@ -1,0 +1,218 @@
+"""What every stream is: a frozen dataclass of typed columns, one field a quantity, one file a stream.
+
+Rows are samples; arrays are read-only; every field declares its file columns, so that the table on disk and the
+object in memory are the same thing. A stream checks itself when it is built: shapes, finite values, time order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from smartnav_graph.core.errors import SessionError
+
+Array = NDArray[Any]
+
+_DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
+
+
+def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool = False) -> Any:
+    """A field stored as the file columns `names`; `nan` marks a quantity whose rows may be unknown."""
+    meta = {"columns": names, "kind": kind, "nan": nan}
+    return field(metadata=meta) if not optional else field(default=None, metadata=meta)
+
+
+def axes(template: str, axes: str = "xyz", **kwargs: Any) -> Any:
+    return quantity(*(template.format(axis) for axis in axes), **kwargs)
+
+
+class Label(NamedTuple):
+    """Words and colour of a stream or a factor for people.
+
+    title : of a sensor in tables; one, many : of its rows; source : in a sentence, ``the <many>`` where it is empty;
+    assumes : what it means, where no sensor measured it; colour : red, green, blue
+    """
+
+    title: str
+    one: str
+    many: str
+    source: str = ""
+    assumes: str = ""
+    colour: tuple[int, int, int] = (190, 130, 255)
+
+    @property
+    def as_source(self) -> str:
+        """``the GNSS fixes``."""
+        return self.source or f"the {self.many}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stream:
+    """Base of every stream. `t_ns` (n,) int64 on the session's clock; `extra` keeps unknown columns."""
+
+    NAME: ClassVar[str]
+    LABEL: ClassVar[Label]
+    ABSOLUTE: ClassVar[bool] = False  # rows tie the trajectory to places, and make keyframes
+    AIDING: ClassVar[bool] = False  # rows measure the motion
+    UNIQUE_TIMES: ClassVar[bool] = True
+    ONE_OF: ClassVar[tuple[str, ...]] = ()
+
+    t_ns: NDArray[np.int64] = quantity("t_ns", kind="int")
+    arrival_ns: NDArray[np.int64] | None = quantity("arrival_ns", kind="int", optional=True)
+    extra: Mapping[str, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def available_ns(self) -> NDArray[np.int64]:
+        """When each row (n,) became known."""
+        return self.t_ns if self.arrival_ns is None else self.arrival_ns
+
+    def __post_init__(self) -> None:
+        for spec in self.specs():
+            value = getattr(self, spec.name)
+            if value is not None:
+                object.__setattr__(self, spec.name, self._checked(spec, value))
+        self._check_rows()
+
+    @classmethod
+    def specs(cls) -> list[Field[Any]]:
+        """The fields that are file columns."""
+        return [f for f in fields(cls) if "columns" in f.metadata]
+
+    def _checked(self, spec: Field[Any], value: Any) -> Array:
+        names, kind = spec.metadata["columns"], spec.metadata["kind"]
+        array: Array = np.array(value, dtype=_DTYPES[kind])
+        shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
+        if array.shape != shape:
+            raise SessionError(
+                self.NAME, f"{spec.name} has shape {array.shape}", f"{shape}, one row a time stamp", stream=self.NAME
+            )
+        if kind == "float":
+            bad = np.isinf(array) if spec.metadata["nan"] else ~np.isfinite(array)
+            if bad.any():
+                where = np.argwhere(bad)[0]
+                name = names[int(where[1]) if len(where) > 1 else 0]
+                raise SessionError(
+                    self.NAME,
+                    f"{name} is {array[tuple(where)]} at row {where[0]} ({int(bad.sum())} such values in all)",
+                    "finite numbers",
+                    "correct the row, or add --repair nan to drop such rows, counted",
+                    row=int(where[0]),
+                    stream=self.NAME,
+                )
+        array.flags.writeable = False
+        return array
+
+    def _check_rows(self) -> None:
+        present = [name for name in self.ONE_OF if getattr(self, name) is not None]
+        if self.ONE_OF and len(present) != 1:
+            columns = " or ".join(", ".join(f.metadata["columns"]) for f in self.specs() if f.name in self.ONE_OF)
+            found = "position columns missing" if not present else "both geodetic and local position columns"
+            raise SessionError(self.NAME, found, f"either {columns}", stream=self.NAME)
+        step = np.diff(self.t_ns)
+        bad = np.flatnonzero(step <= 0 if self.UNIQUE_TIMES else step < 0)
+        if len(bad):
+            row = int(bad[0]) + 1
+            raise SessionError(
+                self.NAME,
+                f"t_ns not {'strictly ' if self.UNIQUE_TIMES else ''}increasing at row {row} "
+                f"(step {int(step[row - 1])} ns; {len(bad)} such rows in all)",
+                "> 0" if self.UNIQUE_TIMES else ">= 0",
+                "correct the file, or add --repair order to sort rows and drop repeated stamps, counted",
+                row=row,
+                stream=self.NAME,
+            )
+        early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
+        if len(early):
+            row = int(early[0])
+            lead = int(self.t_ns[row] - np.asarray(self.arrival_ns)[row])
+            raise SessionError(
+                self.NAME,
+                f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)",
+                "a row becomes known at or after the time it speaks of",
+                "correct the column, or leave it out",
+                row=row,
+                stream=self.NAME,
+            )
+        for name in self.__dataclass_fields__:
+            if "sigma" in name and getattr(self, name) is not None:
+                sigma = np.asarray(getattr(self, name))
+                low = np.argwhere(sigma <= 0)
+                if len(low):
+                    raise SessionError(
+                        self.NAME,
+                        f"{name} is {sigma[tuple(low[0])]} at row {low[0][0]}",
+                        "standard deviations > 0",
+                        "leave the value empty where it is not known",
+                        row=int(low[0][0]),
+                        stream=self.NAME,
+                    )
+
+    def take(self, rows: NDArray[Any] | slice) -> Self:
+        """The same stream with only these rows (mask, indices or slice)."""
+        values = {f.name: getattr(self, f.name) for f in self.specs()}
+        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
+        return type(self)(**chosen, extra={name: value[rows] for name, value in self.extra.items()})
+
+    def columns(self) -> dict[str, Array]:
+        """File columns, in order; the inverse of `from_columns`."""
+        out: dict[str, Array] = {}
+        for spec in self.specs():
+            value = getattr(self, spec.name)
+            if value is None:
+                continue
+            names = spec.metadata["columns"]
+            out.update({names[0]: value} if len(names) == 1 else dict(zip(names, value.T, strict=True)))
+        return out | dict(self.extra)
+
+    @classmethod
+    def from_columns(cls, table: Mapping[str, Array]) -> Self:
+        """Build from file columns. Unknown columns are kept in `extra`.
+
+        Raises
+        ------
+        SessionError
+            A required column, or a part of a column group, is missing; or a row is invalid.
+        """
+        values: dict[str, Any] = {}
+        known: set[str] = set()
+        for spec in cls.specs():
+            names = spec.metadata["columns"]
+            there = [name for name in names if name in table]
+            known.update(there)
+            if len(there) == len(names):
+                rows: list[Array] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
+                values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
+            elif there or spec.default is MISSING:
+                missing = [name for name in names if name not in table]
+                raise SessionError(
+                    cls.NAME,
+                    f"column {', '.join(missing)} is missing",
+                    f"columns {', '.join(names)}",
+                    f"the file has {', '.join(table) or 'no columns'}; rename or add the column",
+                    stream=cls.NAME,
+                )
+        return cls(**values, extra={name: np.asarray(table[name]) for name in table if name not in known})
+
+
+LLA = ("lat_deg", "lon_deg", "height_m")
+ENU = ("e_m", "n_m", "u_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Positioned(Stream):
+    """Rows with a position: `lla` (lat deg, lon deg, ellipsoidal height m) or `enu` metres of the local frame."""
+
+    ABSOLUTE: ClassVar[bool] = True
+    AIDING: ClassVar[bool] = True
+    ONE_OF: ClassVar[tuple[str, ...]] = ("lla", "enu")
+
+    lla: Array | None = quantity(*LLA, optional=True)
+    enu: Array | None = quantity(*ENU, optional=True)
+    sigma: Array | None = axes("sigma_{}_m", "enu", optional=True, nan=True)
