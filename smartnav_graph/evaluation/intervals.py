@@ -30,7 +30,7 @@ from smartnav_graph.estimate.replay import replay
 from smartnav_graph.estimate.result.assemble import kinematics, placed, predict_sensor
 from smartnav_graph.estimate.run import Run
 from smartnav_graph.evaluation.metrics import Statistics
-from smartnav_graph.graph.interpolate import foretold_at
+from smartnav_graph.graph.interpolate import predicted_at
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import ABSOLUTE, PoseFix, Reference
 
@@ -236,5 +236,5 @@ class ReferencePoint:
         """Its position (n, 3) predicted from the keyframe before `t_ns`. No later data is used: the time offset is
         bridged with the velocity."""
         assert run.causal is not None  # of a replay
-        there = foretold_at(run.causal_windows, kinematics(run.causal), run.session.gravity, t_ns)
+        there = predicted_at(run.causal_windows, kinematics(run.causal), run.session.gravity, t_ns)
         return placed(there, np.full(len(t_ns), self.offset_s), np.array(self.lever))

@@ -6,7 +6,7 @@ rotation linearly, position and velocity by the cubic that meets both at both en
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,9 @@ from smartnav_graph.core.so3 import exp, log, rotate
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.windows import Window
 
+# Inertial samples that are integrated together: some twenty megabytes.
+MOST_SAMPLES = 1 << 16
+
 
 class Kinematics(NamedTuple):
     """Attitude (n, 3, 3), position (n, 3) m and velocity (n, 3) m/s in nav, with bias (n, 6) accel then gyro."""
@@ -25,12 +28,6 @@ class Kinematics(NamedTuple):
     p: Floats
     v: Floats
     bias: Floats
-
-
-def _advance(R: Floats, p: Floats, v: Floats, accel: Floats, gyro: Floats, dt: Floats, g: Floats) -> tuple[Floats, ...]:
-    """One interval for many rows, as preintegration does it (see `keyframes.make_windows` on the half turn)."""
-    a = rotate(R, accel) + g
-    return R @ exp(gyro * dt[:, None]), p + v * dt[:, None] + 0.5 * a * dt[:, None] ** 2, v + a * dt[:, None]
 
 
 def states_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
@@ -64,31 +61,63 @@ def _integrated(
     t_ns: NDArray[np.int64],
 ) -> tuple[Kinematics, Kinematics]:
     """From the keyframe before each window (rows `index` - 1 of `states`) to the times t_ns (q,), each inside window
-    `where` (q,), and to the windows' ends."""
-    count, depth = len(windows), max(len(w.dt) for w in windows)
-    dt = np.zeros((count, depth))
-    accel, gyro = np.zeros((count, depth, 3)), np.zeros((count, depth, 3))
-    for row, w in enumerate(windows):
-        m = len(w.dt)
-        dt[row, :m], accel[row, :m], gyro[row, :m] = w.dt, w.accel, w.gyro
-    bias = states.bias[index - 1]
-    accel -= bias[:, None, :3]
-    gyro -= bias[:, None, 3:]
-    g = np.array([0.0, 0.0, -gravity])
-
-    R = np.empty((depth + 1, count, 3, 3))
-    p, v = np.empty((depth + 1, count, 3)), np.empty((depth + 1, count, 3))
-    R[0], p[0], v[0] = states.R[index - 1], states.p[index - 1], states.v[index - 1]
-    for j in range(depth):
-        R[j + 1], p[j + 1], v[j + 1] = _advance(R[j], p[j], v[j], accel[:, j], gyro[:, j], dt[:, j], g)
-
-    ends = Kinematics(R[depth], p[depth], v[depth], states.bias[index - 1])
+    `where` (q,), and to the windows' ends; windows of about the same length together."""
+    before = Kinematics(*(x[index - 1] for x in states))
+    ends, there = Kinematics(*(x.copy() for x in before)), Kinematics(*(x[where] for x in before))
     tau = (t_ns - np.array([w.t0_ns for w in windows], dtype=np.int64)[where]) / NS
-    border = np.concatenate([np.zeros((count, 1)), np.cumsum(dt, axis=1)], axis=1)
-    j = np.minimum((border[where] <= tau[:, None]).sum(axis=1) - 1, depth - 1)
-    part = tau - border[where, j]
-    Rq, pq, vq = _advance(R[j, where], p[j, where], v[j, where], accel[where, j], gyro[where, j], part, g)
-    return Kinematics(Rq, pq, vq, ends.bias[where]), ends
+    place = np.empty(len(windows), dtype=np.intp)
+    for group in _alike(np.array([len(w.dt) for w in windows])):
+        place[:] = -1
+        place[group] = np.arange(len(group))
+        asked = np.flatnonzero(place[where] >= 0)
+        start = Kinematics(*(x[group] for x in before))
+        found = _of_group([windows[k] for k in group], start, gravity, place[where[asked]], tau[asked])
+        for whole, part, rows in ((there, found[0], asked), (ends, found[1], group)):
+            for target, source in zip(whole[:3], part, strict=True):
+                target[rows] = source
+    return there, ends
+
+
+def _alike(lengths: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Rows in groups whose lengths (n,) differ by less than two, of at most `MOST_SAMPLES` unless a row alone has
+    more."""
+    order = np.argsort(-lengths, kind="stable")
+    first = 0
+    while first < len(order):
+        longest = int(lengths[order[first]])
+        alike = int(np.searchsorted(-lengths[order], -longest / 2, side="left"))
+        last = max(min(alike, first + MOST_SAMPLES // max(longest, 1)), first + 1)
+        yield order[first:last]
+        first = last
+
+
+def _of_group(
+    windows: Sequence[Window], start: Kinematics, gravity: float, where: NDArray[np.intp], tau: Floats
+) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+    """Attitude, position and velocity `tau` (q,) s after the begin of windows `where` (q,), and at the ends of the
+    windows, as preintegration does it (see `keyframes.make_windows` on the half turn)."""
+    count, depth = len(windows), max(len(w.dt) for w in windows)
+    dt, force, rate = np.zeros((depth, count, 1)), np.zeros((depth, count, 3)), np.zeros((depth, count, 3))
+    interval = np.empty(len(where), dtype=np.intp)
+    part = np.empty((len(where), 1))
+    rows = np.split(np.argsort(where, kind="stable"), np.cumsum(np.bincount(where, minlength=count))[:-1])
+    for k, (w, asked) in enumerate(zip(windows, rows, strict=True)):
+        m = len(w.dt)
+        dt[:m, k, 0], force[:m, k], rate[:m, k] = w.dt, w.accel - start.bias[k, :3], w.gyro - start.bias[k, 3:]
+        border = np.concatenate([[0.0], np.cumsum(w.dt)])
+        interval[asked] = np.minimum(np.searchsorted(border, tau[asked], side="right") - 1, m - 1)
+        part[asked, 0] = tau[asked] - border[interval[asked]]
+    R = np.empty((depth + 1, count, 3, 3))
+    R[0] = start.R
+    for j, turn in enumerate(exp((rate * dt).reshape(-1, 3)).reshape(depth, count, 3, 3)):
+        np.matmul(R[j], turn, out=R[j + 1])
+    a = np.einsum("...ij,...j->...i", R[:-1], force) + np.array([0.0, 0.0, -gravity])
+    v = np.cumsum(np.concatenate([start.v[None], a * dt]), axis=0)
+    p = np.cumsum(np.concatenate([start.p[None], v[:-1] * dt + 0.5 * a * dt**2]), axis=0)
+    at = interval, where
+    turned = R[at] @ exp(rate[at] * part)
+    moved = p[at] + v[at] * part + 0.5 * a[at] * part**2
+    return (turned, moved, v[at] + a[at] * part), (R[-1], p[-1], v[-1])
 
 
 def _inside(
@@ -113,10 +142,10 @@ def _inside(
     )
 
 
-def foretold_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
-    """States that the keyframe before foretells, at times in (windows[0].t1_ns, windows[-1].t1_ns].
+def predicted_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:
+    """States predicted from the keyframe before, at times in (windows[0].t1_ns, windows[-1].t1_ns].
 
-    At a keyframe's own time that is what was foretold of it. Parameters as `states_at`; `states` may be causal ones.
+    At a keyframe's own time that is its prediction. Parameters as `states_at`; `states` may be causal ones.
     """
     ends = np.array([w.t1_ns for w in windows], dtype=np.int64)
     index = np.searchsorted(ends, t_ns)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from exact import GRAVITY, START_NS, angle_deg, eight, kinematics, record
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.graph.interpolate import Kinematics, states_at
+from smartnav_graph.graph.interpolate import Kinematics, predicted_at, states_at
 from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.graph.windows import Window
 from smartnav_graph.simulation import motions
 
 MOTIONS = {
@@ -183,3 +186,59 @@ def test_the_order_of_the_times_does_not_matter():
     t = inner_times(windows, n=50)
     back = states_at(windows, disturbed(truth), GRAVITY, t[::-1])
     np.testing.assert_allclose(back.p[::-1], states_at(windows, disturbed(truth), GRAVITY, t).p, atol=1e-12)
+
+
+def integrated_one_by_one(window, states: Kinematics, row: int, t_ns: int) -> tuple[np.ndarray, ...]:
+    """State at t_ns inside a window from the keyframe before it, `row`: one interval after the other."""
+    R, p, v, bias = (x[row] for x in states)
+    left = (t_ns - window.t0_ns) / NS
+    for dt, accel, gyro in zip(window.dt, window.accel, window.gyro, strict=True):
+        step = min(dt, left)
+        a = R @ (accel - bias[:3]) - [0.0, 0.0, GRAVITY]
+        p, v = p + v * step + 0.5 * a * step**2, v + a * step
+        R = R @ Rotation.from_rotvec((gyro - bias[3:]) * step).as_matrix()
+        left -= step
+    return R, p, v
+
+
+def uneven(lengths_s, hertz: int = 100):
+    """Windows of these lengths with arbitrary readings, and states of arbitrary motion at their ends."""
+    rng = np.random.default_rng(3)
+    ends = np.concatenate([[0], np.cumsum(np.rint(np.array(lengths_s) * hertz).astype(np.int64))])
+    windows = [Window(0, 0, 0, "first", np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))]
+    for k, (first, last) in enumerate(pairwise(ends.tolist()), start=1):
+        shape = (last - first, 3)
+        accel, gyro = rng.normal([0.0, 0.0, GRAVITY], 1.0, shape), rng.normal(0.0, 0.3, shape)
+        span = (first * NS // hertz, last * NS // hertz)
+        windows.append(Window(k, *span, "normal", np.full(last - first, 1.0 / hertz), accel, gyro))
+    n = len(windows)
+    rows = (
+        Rotation.random(n, random_state=1).as_matrix(),
+        *rng.normal(0.0, 10.0, (2, n, 3)),
+        rng.normal(0, 0.01, (n, 6)),
+    )
+    return windows, Kinematics(*rows)
+
+
+def test_windows_of_all_lengths_are_integrated_as_each_alone():
+    windows, states = uneven([1.0, 0.03, 7.0, 1.0, 0.5, 2.0, 0.01, 1.0, 1.5, 0.2])
+    t = inner_times(windows, n=60)
+    t = t[~np.isin(t, [w.t1_ns for w in windows])]
+    found = predicted_at(windows, states, GRAVITY, t)
+    for i, stamp in enumerate(t.tolist()):
+        row = int(np.searchsorted([w.t1_ns for w in windows], stamp))
+        for part, expected in zip(found, integrated_one_by_one(windows[row], states, row - 1, stamp), strict=False):
+            np.testing.assert_allclose(part[i], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+
+
+def test_one_long_window_among_many_costs_no_more_than_its_samples():
+    """Ten minutes among 1800 windows of a second: with each padded to the longest, 15 GB."""
+    windows, states = uneven([1.0] * 900 + [600.0] + [1.0] * 900)
+    t = np.arange(NS // 3, windows[-1].t1_ns, NS // 2)
+    tracemalloc.start()
+    try:
+        states_at(windows, states, GRAVITY, t)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 100e6  # 21 MB
