@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.so3 import exp, log, rotate
+from smartnav_graph.core.so3 import exp, log
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.windows import Window
 
