@@ -1,4 +1,4 @@
-"""What the rays of two cameras say once the rotation is taken out: parallax, and which of the matches lie in front.
+"""Rays of two cameras after the rotation is removed: parallax, and which matches lie in front (cheirality).
 
 Source: Hartley, Zisserman (2004), Multiple View Geometry, 9.6.2 (the four poses of one essential matrix).
 """
@@ -10,19 +10,19 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.vision.epipolar import cross, rays
-from smartnav_graph.vision.refine import Matched, angle
+from smartnav_graph.vision.refine import MatchedPoints, angle
 
-CLEAR = 3.0  # sigmas of parallax from which on front and behind are certain
-ALIKE = 0.1  # of the matches: below that difference of votes two poses lie equally well in front
+CLEAR = 3.0  # sigmas of parallax beyond which front and behind are certain
+ALIKE = 0.1  # share of the matches: smallest significant difference of votes between two poses
 
 
-def parallax(matched: Matched, R: Floats) -> Floats:
-    """Angle (m,) rad between the rays of each match, turned into the same axes."""
+def parallax(matched: MatchedPoints, R: Floats) -> Floats:
+    """Angle (m,) rad between the rays of each match, in the same axes."""
     a, y = rays(matched.xy0), rays(matched.xy1) @ R.T
     return np.asarray(np.arctan2(np.linalg.norm(cross(a, y), axis=1), np.einsum("mi,mi->m", a, y)))
 
 
-def in_front(matched: Matched, R: Floats, t: Floats) -> Floats:
+def in_front(matched: MatchedPoints, R: Floats, t: Floats) -> Floats:
     """Vote (m,) of every match: 1 in front of both cameras, -1 behind one, nearer to 0 the less parallax it has.
 
     Depths a, b of x0~ a = y b + t with y = R x1~ and n = x0~ x y: a = (t x y) . n / n^2, b = (t x x0~) . n / n^2.
@@ -36,14 +36,14 @@ def in_front(matched: Matched, R: Floats, t: Floats) -> Floats:
     return np.asarray(np.where((first > 0) & (second > 0), weight, -weight))
 
 
-def faced(matched: Matched, R: Floats, t: Floats, *, known_rotation: bool) -> tuple[Floats, Floats]:
+def cheirality(matched: MatchedPoints, R: Floats, t: Floats, *, known_rotation: bool) -> tuple[Floats, Floats]:
     """Of the four poses of one essential matrix the one with the scene in front: c0_R_c1, c0_t_c1.
 
-    Where two do alike the smaller rotation is taken: without parallax the twin, half a turn round the baseline, cannot
-    be told by the matches. A rotation known beforehand has no twin.
+    Of two equally good poses that of the smaller rotation is taken: without parallax the matches cannot distinguish the
+    second one, half a turn about the baseline. With a known rotation there is no second one.
     """
-    twin = exp(np.pi * t) @ R
-    turns = [R] if known_rotation else [R, twin]
+    second = np.asarray(Rotation.from_rotvec(np.pi * t).as_matrix() @ R)
+    turns = [R] if known_rotation else [R, second]
     poses = [(turn, side * t) for turn in turns for side in (1.0, -1.0)]
     votes = [float(in_front(matched, *pose).sum()) for pose in poses]
     least = max(votes) - ALIKE * len(matched.sigma)

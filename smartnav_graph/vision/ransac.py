@@ -1,4 +1,4 @@
-"""First values of a relative pose from matches of which some are wrong: samples, and the agreement of all others.
+"""Initial values of a relative pose from matches of which some are wrong: samples, tested on all other matches.
 
 Deterministic: the seed is passed in.
 
@@ -9,7 +9,7 @@ rotation is known).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,21 @@ from numpy.typing import NDArray
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.vision.epipolar import rays
 from smartnav_graph.vision.gating import Geometry
-from smartnav_graph.vision.refine import GATE, Matched, angle
+from smartnav_graph.vision.refine import GATE, MatchedPoints, angle
+
+if TYPE_CHECKING:
+    import cv2
 
 Pose = tuple[Floats, Floats]  # c0_R_c1 (3, 3), c0_t_c1 (3,) of unit length
 
-SAMPLES = 64  # of two matches: with 60 % outliers all of them hold one but once in 10^5
-REACH_OF_MAGSAC = 1.5  # its threshold in sigmas; it integrates over the noise itself
+SAMPLES = 64  # of two matches: with 60 % outliers all samples hold one only once in 10^5
+THRESHOLD_OF_MAGSAC = 1.5  # in sigmas; MAGSAC++ integrates over the noise
 CONFIDENCE = 0.999
 MOST_TRIALS = 2000
 PIXELS_A_SIGMA = 0.7
-PIXELS_OF_COLMAP = 2.0  # its threshold
+PIXELS_OF_COLMAP = 2.0  # threshold
 OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
-LEAST = 6  # matches that a general pose needs: five unknowns and one to judge it by
+LEAST = 6  # matches for a general pose: five unknowns and one to test it
 
 
 def _samples(m: int, seed: int) -> NDArray[np.int64]:
@@ -38,7 +41,7 @@ def _samples(m: int, seed: int) -> NDArray[np.int64]:
     return np.column_stack([first, (first + draw.integers(1, m, SAMPLES)) % m])
 
 
-def turns(matched: Matched, seed: int) -> Floats:
+def rotation_by_samples(matched: MatchedPoints, seed: int) -> Floats:
     """The rotation (3, 3) without a baseline that most matches agree with."""
     u0, u1 = (_unit(rays(xy)) for xy in (matched.xy0, matched.xy1))
     pairs = _samples(len(u0), seed)
@@ -51,20 +54,20 @@ def turns(matched: Matched, seed: int) -> Floats:
 
 
 def _triad(pairs: Floats) -> Floats:
-    """Axes (n, 3, 3) that two unit rays (n, 2, 3) span."""
+    """Orthonormal axes (n, 3, 3) from two unit rays (n, 2, 3)."""
     along = _unit(pairs[:, 0] + pairs[:, 1])
     across = _unit(np.cross(pairs[:, 0], pairs[:, 1]))
     return np.stack([along, across, np.cross(along, across)], axis=2)
 
 
-def directions(matched: Matched, R: Floats, spread: float, seed: int) -> Pose:
+def direction_by_samples(matched: MatchedPoints, R: Floats, spread: float, seed: int) -> Pose:
     """R with the direction of the baseline that most matches agree with; the sign is open.
 
-    With the rotation known every match holds the baseline in a plane, n . t = 0 with n = x0~ x R x1~, and two planes
-    meet in a direction. `spread` rad is the sigma of the rotation.
+    With the rotation known every match gives a plane that contains the baseline, n . t = 0 with n = x0~ x R x1~; two
+    planes intersect in a direction. `spread` rad is the sigma of the rotation.
     """
-    alone = np.ones((1, len(matched.xy0)), dtype=bool)
-    geometry = Geometry(rays(matched.xy0)[None], (rays(matched.xy1) @ R.T)[None], R[None], alone)
+    one_pair = np.ones((1, len(matched.xy0)), dtype=bool)
+    geometry = Geometry(rays(matched.xy0)[None], (rays(matched.xy1) @ R.T)[None], R[None], one_pair)
     n, pairs = geometry.normals[0], _samples(len(matched.xy0), seed)
     t = _unit(np.cross(n[pairs[:, 0]], n[pairs[:, 1]]))
     gate = GATE**2 * (matched.sigma**2 + spread**2)
@@ -74,26 +77,26 @@ def directions(matched: Matched, R: Floats, spread: float, seed: int) -> Pose:
     return R, np.asarray(t[best] if np.isfinite(cost[best]) else OPTICAL_AXIS)
 
 
-def usac(seed: int) -> Any:
+def usac(seed: int) -> cv2.UsacParams:
     """Options of OpenCV's MAGSAC++ for points in the pixels of `pixels_a_unit`."""
     import cv2
 
     params = cv2.UsacParams()
     params.confidence, params.maxIterations, params.randomGeneratorState = CONFIDENCE, MOST_TRIALS, seed
-    params.threshold = REACH_OF_MAGSAC * PIXELS_A_SIGMA
+    params.threshold = THRESHOLD_OF_MAGSAC * PIXELS_A_SIGMA
     params.score, params.loMethod = cv2.SCORE_METHOD_MAGSAC, cv2.LOCAL_OPTIM_SIGMA
     return params
 
 
-def pixels_a_unit(matched: Matched) -> float:
-    """Focal length of a camera whose sigma is `PIXELS_A_SIGMA`: OpenCV's and pycolmap's constants are meant for pixels.
+def pixels_a_unit(matched: MatchedPoints) -> float:
+    """Focal length of a camera whose sigma is `PIXELS_A_SIGMA`: the constants of OpenCV and pycolmap are in pixels.
 
     (On normalised coordinates MAGSAC++ is three times less accurate, and fails on homographies.)
     """
     return PIXELS_A_SIGMA / float(np.median(matched.sigma))
 
 
-def magsac(matched: Matched, near: Floats, seed: int) -> list[Pose]:
+def magsac(matched: MatchedPoints, near: Floats, seed: int) -> list[Pose]:
     """Pose of the essential matrix that OpenCV's MAGSAC++ finds, of its two rotations the one nearer to `near` (3, 3);
     the sign is open. Empty: none found."""
     import cv2
@@ -108,7 +111,7 @@ def magsac(matched: Matched, near: Floats, seed: int) -> list[Pose]:
     return [(np.asarray(R), np.asarray(-R @ t.ravel()))]
 
 
-def colmap(matched: Matched, near: Floats, seed: int) -> list[Pose]:
+def colmap(matched: MatchedPoints, near: Floats, seed: int) -> list[Pose]:
     """Pose of pycolmap's two-view geometry (LO-RANSAC on five points, four for a plane), which needs no `near`.
     Empty: none found."""
     import pycolmap

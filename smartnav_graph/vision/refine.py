@@ -1,16 +1,16 @@
 """The relative pose that fits matched points best: Levenberg-Marquardt with a loss per match, on three models.
 
-A model tells, of a state whose first element is c0_R_c1 and of m matches, k whitened residuals a match:
+A model gives k whitened residuals for each of m matches, at a state whose first element is c0_R_c1:
 
-    Epipolar   (R, t)      k = 1, coplanarity (Sampson), 5 unknowns: rotation, direction of t
-    Turn       (R,)        k = 2, point transfer without a baseline, 3 unknowns: rotation
-    Plane      (R, t, m)   k = 2, point transfer by a plane m . X1 = 1, 8 unknowns: rotation, direction, plane
+    EpipolarModel   (R, t)      k = 1, coplanarity (Sampson), 5 unknowns: rotation, direction of t
+    RotationModel   (R,)        k = 2, point transfer without a baseline, 3 unknowns: rotation
+    PlaneModel      (R, t, m)   k = 2, point transfer by a plane m . X1 = 1, 8 unknowns: rotation, direction, plane
 
 Rotations change on the right, R <- R Exp(w); directions on the sphere, t <- unit(t + B d) with B = `tangent_basis(t)`.
-Point transfer x0 = h(x1) is weighed with the noise of both images, S = sigma^2 (I + A A^T), A = dh / dx1.
+Point transfer x0 = h(x1) is whitened with the noise of both images, S = sigma^2 (I + A A^T), A = dh / dx1.
 
 Source: Hartley, Zisserman (2004), Multiple View Geometry, 4.2 and 11.4; Marquardt (1963); Geman, McClure (1987) for the
-loss e^2 / (1 + e^2 / c^2), which unlike Cauchy's lets wrong matches cost no more the farther off they are.
+loss e^2 / (1 + e^2 / c^2); unlike Cauchy's it is bounded.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from smartnav_graph.vision.epipolar import cross, rays, sampson
 
 State = tuple[Floats, ...]
 
-REACH = 3.0  # of the loss while inliers are still looked for, in sigmas
-GATE = 3.0  # sigmas a match on a line may miss
-GATE_SQUARE = {1: GATE**2, 2: 11.83}  # squared misses that good matches exceed as seldom, by the number of residuals
+LOSS_SCALE = 3.0  # of the loss before the inliers are known, in sigmas
+GATE = 3.0  # largest distance of a match from its epipolar line, sigmas
+GATE_SQUARE = {1: GATE**2, 2: 11.83}  # the same probability by the number of residuals: squared
 ITERATIONS = 30
-SMALL_STEP, ROUGH_STEP = 1e-3, 0.05  # squared, in units of its covariance: at last, and while inliers are looked for
-SEED_DAMPING = 1e-4
+SMALL_STEP, COARSE_STEP = 1e-3, 0.05  # squared, in units of its covariance; the coarse one before the inliers are known
+FIRST_DAMPING = 1e-4
 
 
 @dataclass(frozen=True)
 class RotationPrior:
-    """What a gyro tells: c0_R_c1 (3, 3), the second camera's axes in the first one's, and its sigma, rad an axis."""
+    """Rotation from the gyro: c0_R_c1 (3, 3), second camera's axes in the first one's, and its sigma, rad an axis."""
 
     c0_R_c1: Floats
     sigma: float
@@ -52,32 +52,32 @@ class RotationPrior:
             raise ConfigError("rotation prior", f"sigma = {self.sigma} rad", "> 0 and finite", "leave the prior out")
 
     def deviation(self, R: Floats) -> Floats:
-        """Turn (3,) in sigmas from the prior to R, right side."""
+        """Rotation vector (3,) in sigmas from the prior to R, on the right."""
         return rotation_vector(self.c0_R_c1.T @ R) / self.sigma
 
 
-class Model(Protocol):
-    """Whitened residuals (m, k) with their derivatives (m, k, p), and the state moved by a step (p,)."""
+class ResidualModel(Protocol):
+    """Whitened residuals (m, k) with their derivatives (m, k, p), and the state changed by a step (p,)."""
 
     def rows(self, state: State) -> tuple[Floats, Floats]: ...
 
-    def moved(self, state: State, step: Floats) -> State: ...
+    def retract(self, state: State, step: Floats) -> State: ...
 
 
-class Matched(NamedTuple):
+class MatchedPoints(NamedTuple):
     """Matches: undistorted normalised points (m, 2) of both images and their sigma (m,)."""
 
     xy0: Floats
     xy1: Floats
     sigma: Floats
 
-    def only(self, rows: NDArray[np.bool_]) -> Matched:
+    def only(self, rows: NDArray[np.bool_]) -> MatchedPoints:
         """Some of them."""
-        return Matched(self.xy0[rows], self.xy1[rows], self.sigma[rows])
+        return MatchedPoints(self.xy0[rows], self.xy1[rows], self.sigma[rows])
 
 
 def tangent_basis(t: Floats) -> Floats:
-    """B (3, 2): unit columns u, v across the unit vector t; u = unit(t x e), e the axis t leans on least, v = t x u."""
+    """B (3, 2): unit columns u, v normal to the unit vector t; u = unit(t x e), e the axis least parallel to t, v = t x u."""
     x, y, z = t
     k = int(np.argmin(np.abs(t)))
     u = np.array([(0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0)][k]) / math.hypot(*np.delete(t, k))
@@ -91,7 +91,7 @@ def angle(R: Floats) -> float:
 
 
 def rotation_vector(R: Floats) -> Floats:
-    """Axis times angle (3,) of a rotation (3, 3); scipy's takes ten times as long, and is left the half turns."""
+    """Axis times angle (3,) of a rotation (3, 3); scipy's takes ten times as long and is used near half turns only."""
     twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = 0.5 * math.sqrt(float(twice @ twice)), 0.5 * (float(np.trace(R)) - 1.0)
     if cosine < -0.99:
@@ -99,48 +99,53 @@ def rotation_vector(R: Floats) -> Floats:
     return 0.5 * twice * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
-def shifted(t: Floats, d: Floats) -> Floats:
+def retract_rotation(R: Floats, w: Floats) -> Floats:
+    """R Exp(w)."""
+    return np.asarray(R @ Rotation.from_rotvec(w).as_matrix())
+
+
+def retract_direction(t: Floats, d: Floats) -> Floats:
     """unit(t + B d)."""
-    moved = t + tangent_basis(t) @ d
-    return np.asarray(moved / np.linalg.norm(moved))
+    other = t + tangent_basis(t) @ d
+    return np.asarray(other / np.linalg.norm(other))
 
 
 @dataclass(frozen=True)
-class Epipolar:
+class EpipolarModel:
     """Coplanarity."""
 
-    matched: Matched
+    matched: MatchedPoints
 
     def rows(self, state: State) -> tuple[Floats, Floats]:
         R, t = state
-        r, by_turn, by_t = sampson(R, t, self.matched.xy0, self.matched.xy1)
-        by_state = np.concatenate([by_turn, by_t @ tangent_basis(t)], axis=1)
+        r, by_rotation, by_t = sampson(R, t, self.matched.xy0, self.matched.xy1)
+        by_state = np.concatenate([by_rotation, by_t @ tangent_basis(t)], axis=1)
         return (r / self.matched.sigma)[:, None], (by_state / self.matched.sigma[:, None])[:, None]
 
-    def moved(self, state: State, step: Floats) -> State:
-        return state[0] @ exp(step[:3]), shifted(state[1], step[3:5])
+    def retract(self, state: State, step: Floats) -> State:
+        return retract_rotation(state[0], step[:3]), retract_direction(state[1], step[3:5])
 
 
 @dataclass(frozen=True)
-class Turn:
+class RotationModel:
     """Point transfer by a rotation alone."""
 
-    matched: Matched
+    matched: MatchedPoints
 
     def rows(self, state: State) -> tuple[Floats, Floats]:
         (R,) = state
         r, by_y = transfer(R, self.matched)
-        return r, by_y @ _by_turn(R, rays(self.matched.xy1))
+        return r, by_y @ _by_rotation(R, rays(self.matched.xy1))
 
-    def moved(self, state: State, step: Floats) -> State:
-        return (state[0] @ exp(step),)
+    def retract(self, state: State, step: Floats) -> State:
+        return (retract_rotation(state[0], step),)
 
 
 @dataclass(frozen=True)
-class Plane:
+class PlaneModel:
     """Point transfer by a plane: x0 ~ (R + t m^T) x1."""
 
-    matched: Matched
+    matched: MatchedPoints
 
     def rows(self, state: State) -> tuple[Floats, Floats]:
         R, t, m = state
@@ -148,16 +153,16 @@ class Plane:
         r, by_y = transfer(R + np.outer(t, m), self.matched)
         by_direction = (b @ m)[:, None, None] * tangent_basis(t)
         by_plane = t[None, :, None] * b[:, None, :]
-        return r, by_y @ np.concatenate([_by_turn(R, b), by_direction, by_plane], axis=2)
+        return r, by_y @ np.concatenate([_by_rotation(R, b), by_direction, by_plane], axis=2)
 
-    def moved(self, state: State, step: Floats) -> State:
-        return state[0] @ exp(step[:3]), shifted(state[1], step[3:5]), state[2] + step[5:]
+    def retract(self, state: State, step: Floats) -> State:
+        return retract_rotation(state[0], step[:3]), retract_direction(state[1], step[3:5]), state[2] + step[5:]
 
 
-def transfer(H: Floats, matched: Matched) -> tuple[Floats, Floats]:
+def transfer(H: Floats, matched: MatchedPoints) -> tuple[Floats, Floats]:
     """Whitened h(x1) - x0 (m, 2) of the homography H (3, 3), and its derivative (m, 2, 3) by y = H x1.
 
-    The whitening is held: its own change is of second order. Points that H sends to infinity miss by very much.
+    The whitening is taken as constant: its change is of second order. Points mapped to infinity have a huge residual.
     """
     y = rays(matched.xy1) @ H.T
     depth = np.where(np.abs(y[:, 2]) > 1e-9, y[:, 2], 1e-9)
@@ -182,13 +187,13 @@ def _whitener(A: Floats) -> Floats:
     return out
 
 
-def _by_turn(R: Floats, b: Floats) -> Floats:
+def _by_rotation(R: Floats, b: Floats) -> Floats:
     """Derivative (m, 3, 3) of R Exp(w) b by w: -R [b]x."""
     return cross(b[:, None, :], R)
 
 
 @dataclass(frozen=True)
-class Fit:
+class PoseFit:
     """State of least cost; whitened residuals (m, k) there, half the loss, and the information (p, p)."""
 
     state: State
@@ -200,33 +205,33 @@ class Fit:
 
     @property
     def square(self) -> Floats:
-        """Squared whitened miss (m,) of every match."""
+        """Squared whitened residual (m,) of every match."""
         return np.asarray(np.einsum("mk,mk->m", self.residual, self.residual))
 
 
-def minimise(
-    model: Model,
+def refine(
+    model: ResidualModel,
     state: State,
     *,
-    reach: float | None = None,
+    loss_scale: float | None = LOSS_SCALE,
     prior: RotationPrior | None = None,
     iterations: int = ITERATIONS,
-) -> Fit:
-    """The state that fits best, from a start.
+) -> PoseFit:
+    """The state of least cost, from an initial value.
 
     Parameters
     ----------
     reach : of a Geman-McClure loss on each match, in sigmas; None: least squares
     prior : added as a residual without loss
     """
-    fit, damping = _weighed(model, state, reach, prior), SEED_DAMPING
+    fit, damping = _linearised(model, state, loss_scale, prior), FIRST_DAMPING
     for _ in range(iterations):
         step = _step(fit, damping)
-        trial = _weighed(model, model.moved(fit.state, step), reach, prior)
+        trial = _linearised(model, model.retract(fit.state, step), loss_scale, prior)
         if trial.cost <= fit.cost:
-            settled = float(step @ fit.information @ step) < (SMALL_STEP if reach is None else ROUGH_STEP)
+            converged = float(step @ fit.information @ step) < (SMALL_STEP if loss_scale is None else COARSE_STEP)
             fit, damping = trial, damping / 10.0
-            if settled:
+            if converged:
                 break
         elif damping > 1e6:
             break
@@ -235,26 +240,26 @@ def minimise(
     return fit
 
 
-def _step(fit: Fit, damping: float) -> Floats:
+def _step(fit: PoseFit, damping: float) -> Floats:
     scale = np.diag(fit.information)
-    floor = 1e-12 * max(float(scale.max()), np.finfo(float).tiny)  # directions nothing is known of stay where they are
+    floor = 1e-12 * max(float(scale.max()), np.finfo(float).tiny)  # unobservable directions do not change
     return np.asarray(-np.linalg.solve(fit.information + np.diag(damping * scale + floor), fit.gradient))
 
 
-def _weighed(model: Model, state: State, reach: float | None, prior: RotationPrior | None) -> Fit:
+def _linearised(model: ResidualModel, state: State, loss_scale: float | None, prior: RotationPrior | None) -> PoseFit:
     r, J = model.rows(state)
     square = np.einsum("mk,mk->m", r, r)
     weight, cost = np.ones(len(r)), 0.5 * float(square.sum())
-    if reach is not None:
-        weight = 1.0 / (1.0 + square / reach**2)
+    if loss_scale is not None:
+        weight = 1.0 / (1.0 + square / loss_scale**2)
         cost, weight = 0.5 * float((square * weight).sum()), weight**2
     flat = (weight[:, None, None] * J).reshape(-1, J.shape[2])
     information = flat.T @ J.reshape(-1, J.shape[2])
     gradient = flat.T @ r.ravel()
     if prior is not None:
-        # d Log(prior^T R Exp(w)) / dw is I but for the deviation itself, which is small where the prior is believed
+        # d Log(prior^T R Exp(w)) / dw is I but for the deviation itself, which is small if the prior is right
         deviation = prior.deviation(state[0])
         information[:3, :3] += np.eye(3) / prior.sigma**2
         gradient[:3] += deviation / prior.sigma
         cost += 0.5 * float(deviation @ deviation)
-    return Fit(state, r, cost, information, gradient, J)
+    return PoseFit(state, r, cost, information, gradient, J)

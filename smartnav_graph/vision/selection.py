@@ -1,11 +1,11 @@
-"""Which geometry two images show: none (static), a rotation, a plane, or depth and a baseline.
+"""Model selection for two images: static, rotation, plane, or general (depth and a baseline).
 
-The geometric robust information criterion weighs the misses of a model against the freedom it takes:
+The geometric robust information criterion (GRIC) adds the residuals of a model and a penalty for its freedom:
 
     GRIC = sum min(e^2, 2 (r - d)) + ln(r) d n + ln(r n) k,    r = 4 coordinates a match
 
-with e^2 the squared miss in units of the noise, d the dimension of the model (3 coplanarity, 2 point transfer) and k
-its unknowns. It is counted over the matches that any of the models explains: the others say nothing of the choice.
+with e^2 the squared residual in units of the noise, d the dimension of the model (3 coplanarity, 2 point transfer) and
+k its unknowns. The sum is over the matches that any of the models explains.
 
 Source: Torr (1998), Geometric motion segmentation and model selection, Phil. Trans. R. Soc. A 356; Moisan, Stival
 (2004), A probabilistic criterion to detect rigid point matches between two images, IJCV 57(3), for `by_chance`.
@@ -21,75 +21,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.vision.refine import GATE_SQUARE, Matched
+from smartnav_graph.vision.refine import GATE_SQUARE, MatchedPoints
 
 COORDINATES = 4
 UNKNOWNS = {"static": 0, "rotation": 3, "planar": 8, "general": 5}
 RESIDUALS = {"static": 2, "rotation": 2, "planar": 2, "general": 1}  # r - d
 # Displacements of a camera at rest are Rayleigh distributed: median 1.67 sigma, known to 1.2 sigma / sqrt(n).
-STILL_MEDIAN, STILL_SPREAD, STILL_LEAST = 1.67, 3.6, 2.0
-STILL_SHARE = 0.9
-MOVED = {"planar", "general"}
-STATED = 20.0  # matches that the sigma stated counts for
+STATIC_MEDIAN, STATIC_SPREAD, STATIC_LEAST = 1.67, 3.6, 2.0
+STATIC_SHARE = 0.9
+MOVING = {"planar", "general"}
+PRIOR_MATCHES = 20.0  # weight of the given sigma, in matches
 
 
-class Explained(NamedTuple):
-    """How a model does: squared misses (m,) in sigmas, and the squared deviation from what was known beforehand."""
+class ModelFit(NamedTuple):
+    """Fit of one model: squared residuals (m,) in sigmas, and the squared deviation from the prior in sigmas."""
 
     square: Floats
     prior: float = 0.0
 
 
-def stands_still(square: Floats) -> bool:
-    """Do the points stay where they were: nearly all of them, and not displaced together by what noise leaves unseen?
+def is_static(square: Floats) -> bool:
+    """Whether nearly all points do not move, and their median displacement is that of noise.
 
     square (m,) : squared displacement, in units of 2 sigma^2
     """
     near = square < GATE_SQUARE[2]
-    if near.mean() < STILL_SHARE:
+    if near.mean() < STATIC_SHARE:
         return False
     median = float(np.sqrt(2.0 * np.median(square[near])))
-    return median < max(STILL_LEAST, STILL_MEDIAN + STILL_SPREAD / math.sqrt(int(near.sum())))
+    return median < max(STATIC_LEAST, STATIC_MEDIAN + STATIC_SPREAD / math.sqrt(int(near.sum())))
 
 
-def noise(square: Floats) -> float:
-    """Variance of the matches in units of the one they were given, from their misses (m,) of the general pose.
+def noise_variance(square: Floats) -> float:
+    """Variance of the matches in units of the one they were given, from their residuals (m,) of the general pose.
 
-    A sigma stated too large would let a plane pass for depth, and one too small depth for a plane. What was stated
-    counts like so many matches.
+    With too large a sigma a general scene is taken for a plane, with too small a sigma a plane for a general scene. The
+    given sigma has the weight of `PRIOR_MATCHES` matches.
     """
     inliers = square[square < GATE_SQUARE[1]]
-    return (float(inliers.sum()) + STATED) / (max(len(inliers) - UNKNOWNS["general"], 0) + STATED)
+    return (float(inliers.sum()) + PRIOR_MATCHES) / (max(len(inliers) - UNKNOWNS["general"], 0) + PRIOR_MATCHES)
 
 
-def gric(kind: str, explained: Explained, rows: NDArray[np.bool_], variance: float) -> float:
+def gric(kind: str, explained: ModelFit, rows: NDArray[np.bool_], variance: float) -> float:
     """The criterion of one model over some of the matches; less is better."""
     n, codimension = int(rows.sum()), RESIDUALS[kind]
-    missed = float(np.minimum(explained.square[rows] / variance, 2.0 * codimension).sum())
+    residuals = float(np.minimum(explained.square[rows] / variance, 2.0 * codimension).sum())
     freedom = math.log(COORDINATES) * (COORDINATES - codimension) * n
-    return missed + freedom + math.log(COORDINATES * n) * UNKNOWNS[kind] + explained.prior
+    return residuals + freedom + math.log(COORDINATES * n) * UNKNOWNS[kind] + explained.prior
 
 
-def choose(models: Mapping[str, Explained]) -> str:
-    """The kind of geometry that explains most with least.
+def select_model(models: Mapping[str, ModelFit]) -> str:
+    """The kind of geometry of the smallest criterion.
 
-    Whether there is a baseline at all is judged by the sigma stated, unless the matches show more noise; a plane is
-    told from depth by the noise that the matches show.
+    Plane and general pose are compared with the noise that the matches show; then with static and rotation, with the
+    given sigma or that noise, whichever is larger.
     """
-    rows = np.any([told.square < GATE_SQUARE[RESIDUALS[kind]] for kind, told in models.items()], axis=0)
+    rows = np.any([fit.square < GATE_SQUARE[RESIDUALS[kind]] for kind, fit in models.items()], axis=0)
     if not rows.any():
         return "general"  # of which too few matches agree
-    variance = noise(models["general"].square)
-    moved = min(models.keys() & MOVED, key=lambda kind: gric(kind, models[kind], rows, variance))
-    kinds = [moved, *sorted(models.keys() - MOVED)]
+    variance = noise_variance(models["general"].square)
+    moving = min(models.keys() & MOVING, key=lambda kind: gric(kind, models[kind], rows, variance))
+    kinds = [moving, *sorted(models.keys() - MOVING)]
     return min(kinds, key=lambda kind: gric(kind, models[kind], rows, max(variance, 1.0)))
 
 
-def by_chance(matched: Matched, agree: int, kind: str, sample: int) -> float:
+def by_chance(matched: MatchedPoints, agree: int, kind: str, sample: int) -> float:
     """Expected number of sets of so many agreeing matches, were all matches wrong and spread over the picture.
 
-    (n - s) C(n, k) C(k, s) p^(k - s), for k of n matches that agree with what s of them fix; p is the share of the
-    picture in which a match agrees: a band along a line, or an ellipse round a point.
+    (n - s) C(n, k) C(k, s) p^(k - s), for k of n matches that agree with a model determined by s of them; p is the
+    share of the picture in which a match agrees: a band along a line, or an ellipse around a point.
     """
     n, k, sigma = len(matched.sigma), agree, float(np.median(matched.sigma))
     if k <= sample or n <= sample:
@@ -101,6 +101,6 @@ def by_chance(matched: Matched, agree: int, kind: str, sample: int) -> float:
     return math.exp(min(logarithm + (k - sample) * math.log(min(share / (width * height), 1.0)), 700.0))
 
 
-def hardly_moves(square: Floats) -> bool:
-    """Is nearly every point where it was, as far as it can tell by itself? square (m,) : see `stands_still`."""
-    return bool((square < GATE_SQUARE[2]).sum() >= STILL_SHARE * max(len(square), 1))
+def is_nearly_static(square: Floats) -> bool:
+    """Whether nearly all points do not move beyond their noise; square (m,) : see `is_static`."""
+    return bool((square < GATE_SQUARE[2]).sum() >= STATIC_SHARE * max(len(square), 1))

@@ -1,12 +1,13 @@
-"""The geometry of two images: what kind it is, the pose of the second camera, how well it is known.
+"""The relative geometry of two images: its kind, the pose of the second camera, and the covariance of the pose.
 
     two_view(xy0, xy1, sigma) -> TwoView
 
-1. The best rotation without a baseline is sought; points that stay where they were are static: no more is fitted.
-2. A first pose comes from one of `METHODS`, and another one from two matches once the rotation is known, or else from
-   a camera that goes straight ahead; the better one is refined on all matches under a redescending loss.
-3. A plane is fitted likewise; rotation, plane and general pose are weighed (`selection`).
-4. Inliers are settled, the pose refined by least squares on them, with the gyro's rotation as one more measurement.
+1. The best rotation without a baseline is found. If the points do not move, the images are static.
+2. First poses come from one of `METHODS`, and from two matches with a known rotation, or else from a camera that moves
+   straight ahead. The best one is refined on all matches under a redescending loss.
+3. A plane is fitted in the same way; rotation, plane and general pose are compared (`selection`).
+4. The inliers are found, and the pose is refined by least squares on them, with the gyro's rotation as one more
+   measurement.
 
 c0_R_c1, c0_t_c1: X0 = c0_R_c1 X1 + baseline c0_t_c1.
 """
@@ -22,49 +23,58 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.vision.parallax import CLEAR, faced, in_front
+from smartnav_graph.vision.parallax import CLEAR, cheirality, in_front, parallax
 from smartnav_graph.vision.planar import CLEARLY_BETTER, PlanarFit, fit_plane
-from smartnav_graph.vision.ransac import LEAST, OPTICAL_AXIS, Pose, colmap, directions, magsac, turns
+from smartnav_graph.vision.ransac import (
+    LEAST,
+    OPTICAL_AXIS,
+    Pose,
+    colmap,
+    direction_by_samples,
+    magsac,
+    rotation_by_samples,
+)
 from smartnav_graph.vision.refine import (
     GATE_SQUARE,
-    REACH,
-    Epipolar,
-    Fit,
-    Matched,
-    Model,
-    Plane,
+    EpipolarModel,
+    MatchedPoints,
+    PlaneModel,
+    PoseFit,
+    ResidualModel,
+    RotationModel,
     RotationPrior,
     State,
-    Turn,
     angle,
-    minimise,
+    refine,
     transfer,
 )
-from smartnav_graph.vision.selection import Explained, by_chance, choose, hardly_moves, stands_still
-from smartnav_graph.vision.uncertainty import Other, covariance, shared, shares
+from smartnav_graph.vision.selection import ModelFit, by_chance, is_nearly_static, is_static, select_model
+from smartnav_graph.vision.uncertainty import Alternative, covariance, mixture_covariance, probabilities
 
 Kind = Literal["static", "rotation", "planar", "general", "failed"]
 
-METHODS: dict[str, Callable[[Matched, Floats, int], list[Pose]]] = {
+METHODS: dict[str, Callable[[MatchedPoints, Floats, int], list[Pose]]] = {
     "magsac": magsac,
     "colmap": colmap,
-    "gyro": lambda matched, near, seed: [],  # two matches and the prior, which all methods try, are all it has
+    "gyro": lambda matched, near, seed: [],  # nothing beyond what all methods try: two matches and the prior
 }
-MODELS: dict[str, Callable[[Matched], Model]] = {"rotation": Turn, "planar": Plane, "general": Epipolar}
-# Matches that fix a pose, and with the rotation known.
+ModelType = Callable[[MatchedPoints], ResidualModel]
+MODELS: dict[str, ModelType] = {"rotation": RotationModel, "planar": PlaneModel, "general": EpipolarModel}
+# Matches that determine a pose, and with a known rotation.
 SAMPLES = {"static": (2, 1), "rotation": (2, 1), "planar": (4, 3), "general": (5, 2)}
-MOST_BY_CHANCE = 0.05  # sets of agreeing matches expected among wrong ones
+MOST_BY_CHANCE = 0.05  # expected sets of agreeing matches among wrong ones
 MOST_DEVIATION = 3.5  # sigmas of the gyro's rotation
-SETTLING = 5  # rounds of inliers and least squares
-LARGEST_SAY, TIMES_THE_MEAN = 0.3, 4.0  # of one match in the pose; the mean say is unknowns / matches
-TURNING = 6  # iterations that a rotation needs if there is no more to it
-TRIED = 3  # iterations that show which start is the best
-# Direction (rad) known worse than this: other baselines are looked for, across the picture and ahead; angle by which
-# they are others (their rotations a tenth of it); iterations that this may take, and cost after the first at which to
-# go on; share of others that is told in words.
-WEAK_DIRECTION, ELSEWHERE, LOOKING, WORTHLESS, WORTH_A_WORD = 0.04, 0.35, 8, 30.0, 0.05
-_ELSEWHERE = [np.array([math.cos(a), math.sin(a), 0.0]) for a in np.pi * np.arange(4) / 4] + [OPTICAL_AXIS]
-TWIN = "another pose explains the plane as well; the smaller rotation was taken"
+INLIER_ROUNDS = 5  # rounds of inliers and least squares
+LARGEST_LEVERAGE, TIMES_THE_MEAN = 0.3, 4.0  # of one match on the pose; the mean leverage is unknowns / matches
+ROTATION_ITERATIONS = 6  # enough for a rotation
+START_ITERATIONS = 3  # enough to compare first poses
+# If the direction is known worse than WEAK_DIRECTION (rad), other baselines are tried, across the picture and ahead.
+# DISTINCT: angle (rad) between the baselines of two different poses (their rotations: a tenth of it).
+WEAK_DIRECTION, DISTINCT = 0.04, 0.35
+ALTERNATIVE_ITERATIONS, LARGEST_COST_DIFFERENCE = 8, 30.0  # of another pose; the cost after START_ITERATIONS
+REPORTED_SHARE = 0.05  # probability of other poses from which the reason mentions them
+_OTHER_DIRECTIONS = [np.array([math.cos(a), math.sin(a), 0.0]) for a in np.pi * np.arange(4) / 4] + [OPTICAL_AXIS]
+PLANE_AMBIGUITY = "another pose explains the plane as well; the smaller rotation was taken"
 AMBIGUOUS = "another pose explains the matches about as well"
 
 
@@ -72,13 +82,14 @@ AMBIGUOUS = "another pose explains the matches about as well"
 class TwoView:
     """Relative geometry of two images.
 
-    kind : static | rotation | planar | general | failed; reason : in words, where there is something to say
+    kind : static | rotation | planar | general | failed; reason : a remark in words, or empty
     c0_R_c1 (3, 3); c0_t_c1 (3,) unit direction of the baseline, zero where there is none
     covariance (5, 5) : [rotation rad, c0_R_c1 Exp(w); direction, unit(c0_t_c1 + B d)], B = `tangent_basis(c0_t_c1)`;
-        infinite variances of what is not known; where another pose explains the matches as well (see reason), the
-        second moment of both. That of a rotation holds if there is no baseline: one too short to show would turn it
-    inliers (m,) : matches the geometry explains
-    chi2_per_dof : of the inliers, and of the prior where there is one; NaN if failed
+        infinite where not observable; if another pose explains the matches as well (see reason), the second moment
+        of both. For kind rotation it assumes no baseline; a baseline too short to be found would bias the rotation
+    inliers (m,) : matches that the geometry explains
+    chi2_per_dof : of the inliers and the prior; NaN if failed
+    parallax_rad : median angle between the inliers' rays after the rotation is removed; NaN if failed
     """
 
     kind: Kind
@@ -111,7 +122,7 @@ def two_view(
 
     Returns
     -------
-    TwoView; of kind ``failed``, with the reason, where the matches allow no answer.
+    TwoView; of kind ``failed``, with the reason, if the matches do not determine a pose.
 
     Raises
     ------
@@ -127,35 +138,39 @@ def two_view(
         raise ConfigError("two-view geometry", "method gyro without a rotation prior", "one", "give it, or use magsac")
     if len(matched.sigma) < LEAST:
         return _failed(len(matched.sigma), f"{len(matched.sigma)} matches; at least {LEAST} are needed")
-    turn = minimise(Turn(matched), (turns(matched, seed),), reach=REACH, prior=prior, iterations=TURNING)
-    at_rest, _ = transfer(np.eye(3), matched)
-    still = np.einsum("mk,mk->m", at_rest, at_rest)
-    if stands_still(still):
-        return _told("static", "", matched, turn.state, prior)
-    return _moved(matched, method, prior, seed, turn, still)
+    first = (rotation_by_samples(matched, seed),)
+    rotation = refine(RotationModel(matched), first, prior=prior, iterations=ROTATION_ITERATIONS)
+    displacement, _ = transfer(np.eye(3), matched)
+    square = np.einsum("mk,mk->m", displacement, displacement)
+    if is_static(square):
+        return _solved("static", matched, rotation.state, prior)
+    return _of_moving_points(matched, method, prior, seed, rotation, square)
 
 
-def _moved(matched: Matched, method: str, prior: RotationPrior | None, seed: int, turn: Fit, still: Floats) -> TwoView:
-    """The geometry of images whose points move."""
-    general = _general(matched, method, prior, seed, turn)
+def _of_moving_points(
+    matched: MatchedPoints, method: str, prior: RotationPrior | None, seed: int, rotation: PoseFit, static: Floats
+) -> TwoView:
+    """The geometry of images whose points move; static (m,) : their squared displacements."""
+    near = rotation.state[0] if prior is None else prior.c0_R_c1
+    general = _general(matched, method, prior, seed, near)
     plane = fit_plane(matched, general.square < GATE_SQUARE[1], prior, seed)
-    models = {"static": Explained(still, _deviation(np.eye(3), prior)), "rotation": _explained(turn, prior)}
+    models = {"static": ModelFit(static, _deviation(np.eye(3), prior)), "rotation": _explained(rotation, prior)}
     models["general"] = _explained(general, prior)
     if plane is not None:
         models["planar"] = _explained(plane.fit, prior)
-    kind = choose(models)
+    kind = select_model(models)
     if kind == "planar" and plane is not None:
-        return _besides(_told("planar", "", matched, plane.fit.state, prior), plane.others, TWIN)
+        return _with_alternatives(_solved("planar", matched, plane.fit.state, prior), plane.others, PLANE_AMBIGUITY)
     if kind == "general":
-        R, t = faced(matched.only(general.square < GATE_SQUARE[1]), *general.state, known_rotation=prior is not None)
-        told = _told("general", "", matched, (R, t), prior)
-        near = turn.state[0] if prior is None else prior.c0_R_c1
-        return _besides(told, [] if told.kind == "failed" else _others(matched, told, plane, near, prior), AMBIGUOUS)
-    at_rest = kind == "static" or hardly_moves(still[turn.square < GATE_SQUARE[2]])
-    return _told("static" if at_rest else "rotation", "", matched, turn.state, prior)
+        pose = _in_front(matched, general, prior)
+        found = _solved("general", matched, pose, prior)
+        others = [] if found.kind == "failed" else _alternatives(matched, found, plane, near, prior)
+        return _with_alternatives(found, others, AMBIGUOUS)
+    at_rest = kind == "static" or is_nearly_static(static[rotation.square < GATE_SQUARE[2]])
+    return _solved("static" if at_rest else "rotation", matched, rotation.state, prior)
 
 
-def _checked(xy0: Floats, xy1: Floats, sigma: float | Floats) -> Matched:
+def _checked(xy0: Floats, xy1: Floats, sigma: float | Floats) -> MatchedPoints:
     first, second = (np.asarray(xy, dtype=np.float64) for xy in (xy0, xy1))
     if first.ndim != 2 or first.shape != second.shape or first.shape[1] != 2:
         raise SessionError("matches", f"shapes {first.shape} and {second.shape}", "(m, 2) twice", stream="matches")
@@ -169,19 +184,19 @@ def _checked(xy0: Floats, xy1: Floats, sigma: float | Floats) -> Matched:
         raise SessionError("matches", f"no finite coordinates at row {row}", "numbers", "drop the row", row=row)
     if not (np.isfinite(spread).all() and (spread > 0).all()):
         raise SessionError("matches", f"sigma = {spread.min():g}", "> 0 and finite", "give normalised units")
-    return Matched(first, second, spread)
+    return MatchedPoints(first, second, spread)
 
 
-def _general(matched: Matched, method: str, prior: RotationPrior | None, seed: int, turn: Fit) -> Fit:
-    """The general pose of least cost, from all starts; turned and signed as it comes."""
-    model, near = Epipolar(matched), turn.state[0] if prior is None else prior.c0_R_c1
+def _general(matched: MatchedPoints, method: str, prior: RotationPrior | None, seed: int, near: Floats) -> PoseFit:
+    """The general pose of least cost, from all starts; which of the four poses of its essential matrix is open."""
+    model = EpipolarModel(matched)
     starts = METHODS[method](matched, near, seed)
-    if prior is None:  # going ahead and turning aside from a sideways baseline look alike: where one is, try the other
+    if prior is None:  # a forward motion looks like a sideways motion with a rotation: try the other one too
         starts.append((near, OPTICAL_AXIS))
     else:
-        starts.append(directions(matched, near, prior.sigma, seed))
-    tried = [minimise(model, start, reach=REACH, prior=prior, iterations=TRIED) for start in starts]
-    return minimise(model, min(tried, key=lambda fit: fit.cost).state, reach=REACH, prior=prior)
+        starts.append(direction_by_samples(matched, near, prior.sigma, seed))
+    tried = [refine(model, start, prior=prior, iterations=START_ITERATIONS) for start in starts]
+    return refine(model, min(tried, key=lambda fit: fit.cost).state, prior=prior)
 
 
 def _deviation(R: Floats, prior: RotationPrior | None) -> float:
@@ -189,120 +204,125 @@ def _deviation(R: Floats, prior: RotationPrior | None) -> float:
     return 0.0 if prior is None else float(np.sum(prior.deviation(R) ** 2))
 
 
-def _explained(fit: Fit, prior: RotationPrior | None) -> Explained:
-    return Explained(fit.square, _deviation(fit.state[0], prior))
+def _explained(fit: PoseFit, prior: RotationPrior | None) -> ModelFit:
+    return ModelFit(fit.square, _deviation(fit.state[0], prior))
 
 
-def _others(
-    matched: Matched, told: TwoView, plane: PlanarFit | None, near: Floats, prior: RotationPrior | None
-) -> list[Other]:
-    """General poses of about the same cost that are not the one told: the two of a plane, and where little parallax
-    leaves the direction weak, other baselines, or the same the other way round."""
-    taken: State = (told.c0_R_c1, told.c0_t_c1)
-    model = Epipolar(matched)
-    cost = minimise(model, taken, reach=REACH, prior=prior, iterations=1).cost
+def _in_front(matched: MatchedPoints, fit: PoseFit, prior: RotationPrior | None) -> Pose:
+    """The pose of a general fit with the scene in front of the cameras."""
+    R, t = fit.state
+    return cheirality(matched.only(fit.square < GATE_SQUARE[1]), R, t, known_rotation=prior is not None)
+
+
+def _alternatives(
+    matched: MatchedPoints, found: TwoView, plane: PlanarFit | None, near: Floats, prior: RotationPrior | None
+) -> list[Alternative]:
+    """General poses other than the one found, of about the same cost: the two of a plane, and where the direction is
+    weak for lack of parallax, other baselines or the reversed one."""
+    taken: State = (found.c0_R_c1, found.c0_t_c1)
+    model = EpipolarModel(matched)
+    cost = refine(model, taken, prior=prior, iterations=1).cost
     starts: list[State] = [] if plane is None else [plane.fit.state[:2], *((one.R, one.t) for one in plane.others)]
-    found: list[Other] = []
-    if np.linalg.eigvalsh(told.covariance[3:, 3:])[-1] > WEAK_DIRECTION**2:
-        starts += [(near, t) for t in _ELSEWHERE]
-        found += _backwards(matched.only(told.inliers), told)
+    others: list[Alternative] = []
+    if np.linalg.eigvalsh(found.covariance[3:, 3:])[-1] > WEAK_DIRECTION**2:
+        starts += [(near, t) for t in _OTHER_DIRECTIONS]
+        others += _reversed_baseline(matched.only(found.inliers), found)
     known: list[State] = [taken]
     for start in starts:
-        fit = minimise(model, start, reach=REACH, prior=prior, iterations=TRIED)
-        if fit.cost - cost > WORTHLESS or any(_alike(fit.state, pose) for pose in known):
+        fit = refine(model, start, prior=prior, iterations=START_ITERATIONS)
+        if fit.cost - cost > LARGEST_COST_DIFFERENCE or any(_same_pose(fit.state, pose) for pose in known):
             continue
-        fit = minimise(model, fit.state, reach=REACH, prior=prior, iterations=LOOKING)
-        if fit.cost - cost < 0.5 * CLEARLY_BETTER and not any(_alike(fit.state, pose) for pose in known):
+        fit = refine(model, fit.state, prior=prior, iterations=ALTERNATIVE_ITERATIONS)
+        if fit.cost - cost < 0.5 * CLEARLY_BETTER and not any(_same_pose(fit.state, pose) for pose in known):
             known.append(fit.state)
-            R, t = faced(matched.only(fit.square < GATE_SQUARE[1]), *fit.state, known_rotation=prior is not None)
-            there = minimise(model, (R, t), reach=REACH, prior=prior, iterations=1)
-            spread = covariance("general", matched, there, prior)
-            found += [] if spread is None else [Other(there.state[0], there.state[1], spread, there.cost - cost)]
-    return found
+            fit = refine(model, _in_front(matched, fit, prior), prior=prior, iterations=1)
+            spread = covariance("general", matched, fit, prior)
+            others += [] if spread is None else [Alternative(fit.state[0], fit.state[1], spread, fit.cost - cost)]
+    return others
 
 
-def _alike(one: State, other: State) -> bool:
-    """Whether two poses are one, but for the sign of the baseline."""
-    return angle(one[0].T @ other[0]) < ELSEWHERE / 10.0 and abs(float(one[1] @ other[1])) > math.cos(ELSEWHERE)
+def _same_pose(one: State, other: State) -> bool:
+    """Whether two poses are the same, except for the sign of the baseline."""
+    return angle(one[0].T @ other[0]) < DISTINCT / 10.0 and abs(float(one[1] @ other[1])) > math.cos(DISTINCT)
 
 
-def _backwards(inliers: Matched, told: TwoView) -> list[Other]:
-    """The same baseline the other way round, if the points do not clearly lie in front: those that do would have to be
-    infinitely far away."""
-    votes = in_front(inliers, told.c0_R_c1, told.c0_t_c1)
-    behind = 0.5 * CLEAR**2 * float((np.sign(votes) * votes**2).sum())
-    if behind >= 0.5 * CLEARLY_BETTER:
+def _reversed_baseline(inliers: MatchedPoints, found: TwoView) -> list[Alternative]:
+    """The reversed baseline, if the points are not clearly in front: those that are would have to be at infinity."""
+    votes = in_front(inliers, found.c0_R_c1, found.c0_t_c1)
+    cost_difference = 0.5 * CLEAR**2 * float((np.sign(votes) * votes**2).sum())
+    if cost_difference >= 0.5 * CLEARLY_BETTER:
         return []
-    return [Other(told.c0_R_c1, -told.c0_t_c1, told.covariance, behind)]
+    return [Alternative(found.c0_R_c1, -found.c0_t_c1, found.covariance, cost_difference)]
 
 
-def _besides(told: TwoView, others: Sequence[Other], reason: str) -> TwoView:
-    """What is told of a pose that others come near to."""
-    if not others or told.kind == "failed":
-        return told
-    spread = shared(told.covariance, (told.c0_R_c1, told.c0_t_c1), others)
-    return replace(told, covariance=spread, reason=reason if sum(shares(others)) > WORTH_A_WORD else "")
+def _with_alternatives(found: TwoView, others: Sequence[Alternative], reason: str) -> TwoView:
+    """The result with the covariance that includes the alternatives."""
+    if not others or found.kind == "failed":
+        return found
+    spread = mixture_covariance(found.covariance, (found.c0_R_c1, found.c0_t_c1), others)
+    return replace(found, covariance=spread, reason=reason if sum(probabilities(others)) > REPORTED_SHARE else "")
 
 
-def _told(kind: Kind, reason: str, matched: Matched, state: State, prior: RotationPrior | None) -> TwoView:
-    """Settle the inliers of a model and tell its pose, or why not."""
-    inliers, fit = _settled(MODELS["rotation" if kind == "static" else kind], matched, state, prior)
+def _solved(kind: Kind, matched: MatchedPoints, state: State, prior: RotationPrior | None) -> TwoView:
+    """The result of one model with its final inliers, or the reason why it fails."""
+    inliers, fit = _final_inliers(MODELS["rotation" if kind == "static" else kind], matched, state, prior)
     spread = None if fit is None else covariance(kind, matched.only(inliers), fit, prior)
-    refused = _refused(kind, matched, int(inliers.sum()), fit, prior)
-    if refused or fit is None or spread is None:
-        return _failed(len(inliers), refused or "the matches leave a direction of the pose open")
+    rejection = _rejection(kind, matched, int(inliers.sum()), fit, prior)
+    if rejection or fit is None or spread is None:
+        return _failed(len(inliers), rejection or "the matches do not determine the pose")
     R, t = fit.state[0], fit.state[1] if len(fit.state) > 1 else np.zeros(3)
     freedom = fit.residual.size + (0 if prior is None else 3) - len(fit.information)
     chi2 = float(fit.square.sum()) + _deviation(R, prior)
-    return TwoView(kind, reason, R, t, spread, inliers, chi2 / freedom)
+    angle = float(np.median(parallax(matched.only(inliers), R)))
+    return TwoView(kind, "", R, t, spread, inliers, chi2 / freedom, angle)
 
 
-def _refused(kind: Kind, matched: Matched, agree: int, fit: Fit | None, prior: RotationPrior | None) -> str:
-    """Why a settled pose is not to be believed; empty where it is."""
-    told = f"{agree} of {len(matched.sigma)} matches agree"
+def _rejection(kind: Kind, matched: MatchedPoints, agree: int, fit: PoseFit | None, prior: RotationPrior | None) -> str:
+    """Why a pose is rejected; empty if it is accepted."""
+    agreement = f"{agree} of {len(matched.sigma)} matches agree"
     if fit is None or agree < LEAST:
-        return f"{told}; at least {LEAST} must"
+        return f"{agreement}; at least {LEAST} must"
     if by_chance(matched, agree, kind, SAMPLES[kind][prior is not None]) > MOST_BY_CHANCE:
-        return f"{told}: as many would by chance"
+        return f"{agreement}: as many would by chance"
     deviation = math.sqrt(_deviation(fit.state[0], prior))
     if prior is not None and deviation > MOST_DEVIATION:
         return f"rotation {math.degrees(deviation * prior.sigma):.2f} deg off the gyro's, {deviation:.1f} sigma"
     return ""
 
 
-def _settled(
-    model: Callable[[Matched], Model], matched: Matched, state: State, prior: RotationPrior | None
-) -> tuple[Mask, Fit | None]:
-    """Inliers of a state and least squares on them, in turn until they stay."""
+def _final_inliers(
+    model: ModelType, matched: MatchedPoints, state: State, prior: RotationPrior | None
+) -> tuple[Mask, PoseFit | None]:
+    """Inliers of a state and least squares on them, repeated until the inliers do not change."""
     checked = np.ones(len(matched.sigma), dtype=bool)
     inliers = _inliers(model, matched, state)
-    for _ in range(SETTLING):
+    for _ in range(INLIER_ROUNDS):
         if inliers.sum() < LEAST:
             return inliers, None
-        fit = minimise(model(matched.only(inliers)), state, prior=prior)
-        checked[np.flatnonzero(inliers)[_unchecked(fit)]] = False
+        fit = refine(model(matched.only(inliers)), state, loss_scale=None, prior=prior)
+        checked[np.flatnonzero(inliers)[_uncontrolled(fit)]] = False
         before, inliers, state = inliers, _inliers(model, matched, fit.state) & checked, fit.state
         if np.array_equal(before, inliers):
             break
     return before, fit
 
 
-def _inliers(model: Callable[[Matched], Model], matched: Matched, state: State) -> Mask:
+def _inliers(model: ModelType, matched: MatchedPoints, state: State) -> Mask:
     r, _ = model(matched).rows(state)
     good = np.asarray(np.einsum("mk,mk->m", r, r) < GATE_SQUARE[r.shape[1]])
-    if model is Epipolar:
-        good &= in_front(matched, *state) > -1.0  # clearly behind a camera is no match, whatever its residual
+    if model is EpipolarModel:
+        good &= in_front(matched, *state) > -1.0  # a point clearly behind a camera is a wrong match
     return good
 
 
-def _unchecked(fit: Fit) -> Mask:
-    """Matches (m,) with so much say in the pose that the others cannot show them wrong (Baarda's redundancy numbers).
+def _uncontrolled(fit: PoseFit) -> Mask:
+    """Matches (m,) of such leverage on the pose that the others cannot test them (Baarda's redundancy numbers).
 
-    A wrong match that happens to agree is such a one: it shows a point far nearer than all the others.
+    A wrong match that happens to agree is of this kind: its point is far nearer than all the others.
     """
     known = np.linalg.pinv(fit.information, hermitian=True)
-    say = np.einsum("mkp,pq,mkq->m", fit.jacobian, known, fit.jacobian)
-    return np.asarray(say > max(LARGEST_SAY, TIMES_THE_MEAN * len(known) / len(say)))
+    leverage = np.einsum("mkp,pq,mkq->m", fit.jacobian, known, fit.jacobian)
+    return np.asarray(leverage > max(LARGEST_LEVERAGE, TIMES_THE_MEAN * len(known) / len(leverage)))
 
 
 def _failed(m: int, reason: str) -> TwoView:

@@ -1,15 +1,15 @@
 """The covariance of a relative pose.
 
-The information J^T J of a fit holds where it is evaluated, and that place is itself uncertain: near the epipole, or
-with little parallax, a fit that happens to err claims to know more than one that does not. So the covariance of a
-general pose is the mean over the poses around the fit that are as probable as the fit's own covariance says,
+The information J^T J of a fit depends on the pose where it is evaluated, which is uncertain itself: near the epipole,
+or with little parallax, it is too large at a wrong pose. So the covariance of a general pose is the mean over poses
+around the fit, the symmetric points of its own covariance,
 
     C = 1/2n sum_k  information(x (+) +- sqrt(n) l_k)^-1,    sum_k l_k l_k^T = information(x)^-1,  n = 5
 
-It is honest where the direction is known to about 0.2 rad; beyond, no Gaussian on a tangent plane tells the truth.
+It holds up to a sigma of the direction of about 0.2 rad; beyond, a Gaussian on the tangent plane is a poor model.
 
-Where other poses x_j = x (+) d_j of covariance C_j explain the matches about as well, with a share p_j of the
-probability, what is told is the second moment of them all about the one that was taken,
+If other poses x_j = x (+) d_j of covariance C_j and probability p_j explain the matches about as well, the result is
+the second moment of all of them about the one taken,
 
     (1 - sum_j p_j) C + sum_j p_j (C_j + d_j d_j^T)
 
@@ -27,28 +27,36 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.vision.epipolar import sampson
-from smartnav_graph.vision.refine import Fit, Matched, RotationPrior, State, rotation_vector, shifted, tangent_basis
+from smartnav_graph.vision.refine import (
+    MatchedPoints,
+    PoseFit,
+    RotationPrior,
+    State,
+    retract_direction,
+    rotation_vector,
+    tangent_basis,
+)
 
 UNKNOWNS = 5
-LARGEST_CONDITION = 1e10  # of the scaled information: more is a direction the matches leave open
+LARGEST_CONDITION = 1e10  # of the scaled information: beyond it the pose is not determined
 
 
-class Other(NamedTuple):
-    """Another pose that explains the matches: c0_R_c1, c0_t_c1, their covariance (5, 5), and by how much of the cost
-    (half the squared misses) it is behind the one taken; negative where it is ahead."""
+class Alternative(NamedTuple):
+    """Another pose that explains the matches: c0_R_c1, c0_t_c1, their covariance (5, 5), and its cost (half the sum of
+    squared residuals) less that of the pose taken."""
 
     R: Floats
     t: Floats
     covariance: Floats
-    behind: float
+    cost_difference: float
 
 
-def covariance(kind: str, matched: Matched, fit: Fit, prior: RotationPrior | None) -> Floats | None:
-    """Covariance (5, 5) of rotation and direction, infinite where there is no baseline; None where a combination of
-    the unknowns is open."""
+def covariance(kind: str, matched: MatchedPoints, fit: PoseFit, prior: RotationPrior | None) -> Floats | None:
+    """Covariance (5, 5) of rotation and direction, infinite without a baseline; None if a combination of the
+    unknowns is not determined."""
     found = inverse(fit.information)
     if found is not None and kind == "general":
-        found = _around(found, matched, fit, prior)
+        found = _mean_covariance(found, matched, fit, prior)
     if found is None:
         return None
     known = found[:UNKNOWNS, :UNKNOWNS]
@@ -57,19 +65,19 @@ def covariance(kind: str, matched: Matched, fit: Fit, prior: RotationPrior | Non
     return out
 
 
-def shared(found: Floats, state: State, others: Sequence[Other]) -> Floats:
+def mixture_covariance(found: Floats, state: State, others: Sequence[Alternative]) -> Floats:
     """The second moment (5, 5) about a pose of covariance `found` (5, 5), of it and of other poses."""
-    share = shares(others)
-    total = (1.0 - sum(share)) * found
-    for other, part in zip(others, share, strict=True):
-        apart = np.concatenate([rotation_vector(state[0].T @ other.R), _away(state[1], other.t)])
-        here = np.zeros((UNKNOWNS, UNKNOWNS))
-        here[:3, :3], here[3:, 3:] = state[0].T @ other.R, _carried(state[1], other.t)
-        total += part * (here @ other.covariance @ here.T + np.outer(apart, apart))
+    probability = probabilities(others)
+    total = (1.0 - sum(probability)) * found
+    for other, part in zip(others, probability, strict=True):
+        difference = np.concatenate([rotation_vector(state[0].T @ other.R), _tangent_vector(state[1], other.t)])
+        to_tangent = np.zeros((UNKNOWNS, UNKNOWNS))
+        to_tangent[:3, :3], to_tangent[3:, 3:] = state[0].T @ other.R, _transported(state[1], other.t)
+        total += part * (to_tangent @ other.covariance @ to_tangent.T + np.outer(difference, difference))
     return total
 
 
-def _carried(t: Floats, other: Floats) -> Floats:
+def _transported(t: Floats, other: Floats) -> Floats:
     """(2, 2) from the tangent plane of one direction to that of t, along the great circle between them."""
     axis, cosine = np.cross(other, t), float(other @ t)
     if cosine < -1.0 + 1e-9:
@@ -79,14 +87,14 @@ def _carried(t: Floats, other: Floats) -> Floats:
     return np.asarray(tangent_basis(t).T @ turn @ tangent_basis(other))
 
 
-def shares(others: Sequence[Other]) -> list[float]:
-    """Probability of each, next to the one taken."""
-    weights = [math.exp(min(-other.behind, 50.0)) for other in others]
+def probabilities(others: Sequence[Alternative]) -> list[float]:
+    """Probability of each, the pose taken being one more."""
+    weights = [math.exp(min(-other.cost_difference, 50.0)) for other in others]
     return [weight / (1.0 + sum(weights)) for weight in weights]
 
 
-def _away(t: Floats, other: Floats) -> Floats:
-    """Direction from the unit vector t to another, as long (2,) as the angle between them, on the tangent plane."""
+def _tangent_vector(t: Floats, other: Floats) -> Floats:
+    """Logarithm (2,) on the sphere: from the unit vector t to another, on the tangent plane of t."""
     across = tangent_basis(t).T @ other
     length = math.hypot(*across)
     return np.asarray(across / length * math.atan2(length, float(t @ other)) if length > 0 else across)
@@ -104,17 +112,17 @@ def inverse(information: Floats) -> Floats | None:
     return np.asarray((vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer)
 
 
-def _around(found: Floats, matched: Matched, fit: Fit, prior: RotationPrior | None) -> Floats | None:
+def _mean_covariance(found: Floats, matched: MatchedPoints, fit: PoseFit, prior: RotationPrior | None) -> Floats | None:
     """Mean covariance over the symmetric points of the covariance `found`."""
     R, t = fit.state
     spread, axes = np.linalg.eigh(found)
     points = (np.sqrt(UNKNOWNS * np.maximum(spread, 0.0)) * axes).T
     steps = np.concatenate([points, -points])
-    turns = R @ exp(steps[:, :3])
-    ways = np.stack([shifted(t, step[3:]) for step in steps])
-    _, by_turn, by_t = sampson(turns, ways, matched.xy0, matched.xy1)
+    turns = R @ Rotation.from_rotvec(steps[:, :3]).as_matrix()
+    ways = np.stack([retract_direction(t, step[3:]) for step in steps])
+    _, by_rotation, by_t = sampson(turns, ways, matched.xy0, matched.xy1)
     across = np.stack([tangent_basis(way) for way in ways])
-    J = np.concatenate([by_turn, by_t @ across], axis=2) / matched.sigma[:, None]
+    J = np.concatenate([by_rotation, by_t @ across], axis=2) / matched.sigma[:, None]
     information = J.transpose(0, 2, 1) @ J
     if prior is not None:
         information[:, :3, :3] += np.eye(3) / prior.sigma**2

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from smartnav_graph.vision.refine import Matched
-from smartnav_graph.vision.selection import Explained, by_chance, choose, noise, stands_still
+from smartnav_graph.vision.refine import MatchedPoints
+from smartnav_graph.vision.selection import ModelFit, by_chance, is_static, noise_variance, select_model
 
 
 @pytest.fixture
@@ -21,32 +21,32 @@ def models(rng, *, truth, n=200, variance=1.0, miss=0.0):
     for kind in order:
         residuals = rng.normal(0.0, math.sqrt(variance), (n, 1 if kind == "general" else 2))
         residuals[:, 0] += miss * (order.index(kind) < order.index(truth))
-        out[kind] = Explained(np.sum(residuals**2, axis=1))
+        out[kind] = ModelFit(np.sum(residuals**2, axis=1))
     return out
 
 
 @pytest.mark.parametrize("truth", ["static", "rotation", "planar", "general"])
 def test_the_simplest_that_explains_is_chosen(rng, truth):
-    assert choose(models(rng, truth=truth, miss=3.0)) == truth
+    assert select_model(models(rng, truth=truth, miss=3.0)) == truth
 
 
 def test_a_deviation_from_what_was_known_counts(rng):
     told = models(rng, truth="static")
-    turned = told | {"static": Explained(told["static"].square, 100.0)}
-    assert choose(told) == "static" and choose(turned) == "rotation"
+    turned = told | {"static": ModelFit(told["static"].square, 100.0)}
+    assert select_model(told) == "static" and select_model(turned) == "rotation"
 
 
 def test_a_sigma_stated_too_large_lets_no_plane_pass_for_depth(rng):
     told = models(rng, truth="general", variance=0.1, miss=1.0)
-    assert noise(told["general"].square) == pytest.approx(0.2, abs=0.05)
-    told |= {kind: Explained(np.full(200, 50.0)) for kind in ("static", "rotation")}
-    assert choose(told) == "general"
-    assert choose(told | {"general": Explained(told["general"].square * 10.0)}) == "planar"  # the noise as stated
+    assert noise_variance(told["general"].square) == pytest.approx(0.2, abs=0.05)
+    told |= {kind: ModelFit(np.full(200, 50.0)) for kind in ("static", "rotation")}
+    assert select_model(told) == "general"
+    assert select_model(told | {"general": ModelFit(told["general"].square * 10.0)}) == "planar"  # the noise as stated
 
 
 def test_whether_there_is_a_baseline_is_judged_by_the_sigma_stated(rng):
     told = models(rng, truth="general", variance=0.1, miss=0.6)
-    assert choose({**told, "planar": Explained(np.full(200, 50.0))}) in ("static", "rotation")
+    assert select_model({**told, "planar": ModelFit(np.full(200, 50.0))}) in ("static", "rotation")
 
 
 @pytest.mark.parametrize("n", [12, 60, 600])
@@ -57,7 +57,7 @@ def test_points_at_rest_stand_still_and_a_shift_shows(rng, n):
             d = rng.normal(0.0, 1.0, (n, 2))  # in units of sqrt(2) sigma
             d[:, 0] += shift / math.sqrt(2.0)
             d[:wrong] = 50.0
-            count += stands_still(np.sum(d**2, axis=1))
+            count += is_static(np.sum(d**2, axis=1))
         return count / 200
 
     assert share(0.0) > 0.97
@@ -67,7 +67,7 @@ def test_points_at_rest_stand_still_and_a_shift_shows(rng, n):
 
 def test_agreement_by_chance(rng):
     def matched(n):
-        return Matched(*rng.uniform(-0.5, 0.5, (2, n, 2)), np.full(n, 0.0015))
+        return MatchedPoints(*rng.uniform(-0.5, 0.5, (2, n, 2)), np.full(n, 0.0015))
 
     n, k, s = 20, 12, 5
     share = 2.0 * math.sqrt(18.0) * 0.0015 * math.sqrt(2.0)  # band over a unit square, about

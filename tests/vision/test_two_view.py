@@ -10,12 +10,12 @@ from view_pairs import FORWARD, NOWHERE, SHORT, SIDEWAYS, SIGMA, turned, view
 
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.vision.refine import (
-    Epipolar,
-    Matched,
-    Plane,
+    EpipolarModel,
+    MatchedPoints,
+    PlaneModel,
+    RotationModel,
     RotationPrior,
-    Turn,
-    minimise,
+    refine,
     rotation_vector,
     tangent_basis,
 )
@@ -79,8 +79,8 @@ def mean_nees(motion, matches, told, seeds):
     out = []
     for seed in seeds:
         pair = view(seed, matches, t=motion)
-        matched = Matched(pair.xy0, pair.xy1, np.full(matches, told))
-        fit = minimise(Epipolar(matched), (pair.R, pair.t))
+        matched = MatchedPoints(pair.xy0, pair.xy1, np.full(matches, told))
+        fit = refine(EpipolarModel(matched), (pair.R, pair.t), loss_scale=None)
         off = error(*fit.state, pair.R, pair.t)
         out.append(off @ np.linalg.solve(covariance("general", matched, fit, None), off) / 5.0)
     return np.mean(out)
@@ -305,17 +305,17 @@ def test_the_vector_of_a_rotation(size):
 @pytest.mark.parametrize("kind", ["rotation", "planar", "general"])
 def test_derivatives_are_those_of_differences(kind):
     pair = view(2, 25, plane=kind == "planar")
-    matched = Matched(pair.xy0, pair.xy1, np.full(25, SIGMA))
+    matched = MatchedPoints(pair.xy0, pair.xy1, np.full(25, SIGMA))
     m = 0.31 * np.array([0.3, 0.2, 1.0]) / 4.0
     model, state = {
-        "rotation": (Turn(matched), (pair.R,)),
-        "planar": (Plane(matched), (pair.R, pair.t, m)),
-        "general": (Epipolar(matched), (pair.R, pair.t)),
+        "rotation": (RotationModel(matched), (pair.R,)),
+        "planar": (PlaneModel(matched), (pair.R, pair.t, m)),
+        "general": (EpipolarModel(matched), (pair.R, pair.t)),
     }[kind]
     _, J = model.rows(state)
     step = 1e-6
     for k in range(J.shape[2]):
-        ahead, behind = (model.rows(model.moved(state, sign * step * np.eye(J.shape[2])[k]))[0] for sign in (1, -1))
+        ahead, behind = (model.rows(model.retract(state, sign * step * np.eye(J.shape[2])[k]))[0] for sign in (1, -1))
         # the whitening of point transfer is held: a relative error of the size of the noise times its change
         atol = 1e-4 * np.abs(J[..., k]).max() if kind == "general" else 0.08 * np.abs(J[..., k]).max()
         np.testing.assert_allclose((ahead - behind) / (2 * step), J[..., k], atol=atol)
