@@ -42,7 +42,7 @@ def cheirality(matched: MatchedPoints, R: Floats, t: Floats, *, known_rotation: 
     Of two equally good poses that of the smaller rotation is taken: without parallax the matches cannot distinguish the
     second one, half a turn about the baseline. With a known rotation there is no second one.
     """
-    second = np.asarray(Rotation.from_rotvec(np.pi * t).as_matrix() @ R)
+    second = exp(np.pi * t) @ R
     turns = [R] if known_rotation else [R, second]
     poses = [(turn, side * t) for turn in turns for side in (1.0, -1.0)]
     votes = [float(in_front(matched, *pose).sum()) for pose in poses]

@@ -77,7 +77,7 @@ class MatchedPoints(NamedTuple):
 
 
 def tangent_basis(t: Floats) -> Floats:
-    """B (3, 2): unit columns u, v normal to the unit vector t; u = unit(t x e), e the axis least parallel to t, v = t x u."""
+    """B (3, 2): unit columns u, v normal to the unit vector t: u = unit(t x e), e the axis least along t; v = t x u."""
     x, y, z = t
     k = int(np.argmin(np.abs(t)))
     u = np.array([(0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0)][k]) / math.hypot(*np.delete(t, k))
@@ -99,11 +99,6 @@ def rotation_vector(R: Floats) -> Floats:
     return 0.5 * twice * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0)
 
 
-def retract_rotation(R: Floats, w: Floats) -> Floats:
-    """R Exp(w)."""
-    return np.asarray(R @ Rotation.from_rotvec(w).as_matrix())
-
-
 def retract_direction(t: Floats, d: Floats) -> Floats:
     """unit(t + B d)."""
     other = t + tangent_basis(t) @ d
@@ -123,7 +118,7 @@ class EpipolarModel:
         return (r / self.matched.sigma)[:, None], (by_state / self.matched.sigma[:, None])[:, None]
 
     def retract(self, state: State, step: Floats) -> State:
-        return retract_rotation(state[0], step[:3]), retract_direction(state[1], step[3:5])
+        return state[0] @ exp(step[:3]), retract_direction(state[1], step[3:5])
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class RotationModel:
         return r, by_y @ _by_rotation(R, rays(self.matched.xy1))
 
     def retract(self, state: State, step: Floats) -> State:
-        return (retract_rotation(state[0], step),)
+        return (state[0] @ exp(step),)
 
 
 @dataclass(frozen=True)
@@ -156,7 +151,7 @@ class PlaneModel:
         return r, by_y @ np.concatenate([_by_rotation(R, b), by_direction, by_plane], axis=2)
 
     def retract(self, state: State, step: Floats) -> State:
-        return retract_rotation(state[0], step[:3]), retract_direction(state[1], step[3:5]), state[2] + step[5:]
+        return state[0] @ exp(step[:3]), retract_direction(state[1], step[3:5]), state[2] + step[5:]
 
 
 def transfer(H: Floats, matched: MatchedPoints) -> tuple[Floats, Floats]:

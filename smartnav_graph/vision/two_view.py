@@ -23,7 +23,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.vision.parallax import CLEAR, cheirality, in_front, parallax
+from smartnav_graph.vision.parallax import CLEAR, cheirality, in_front
 from smartnav_graph.vision.planar import CLEARLY_BETTER, PlanarFit, fit_plane
 from smartnav_graph.vision.ransac import (
     LEAST,
@@ -89,7 +89,6 @@ class TwoView:
         of both. For kind rotation it assumes no baseline; a baseline too short to be found would bias the rotation
     inliers (m,) : matches that the geometry explains
     chi2_per_dof : of the inliers and the prior; NaN if failed
-    parallax_rad : median angle between the inliers' rays after the rotation is removed; NaN if failed
     """
 
     kind: Kind
@@ -273,8 +272,7 @@ def _solved(kind: Kind, matched: MatchedPoints, state: State, prior: RotationPri
     R, t = fit.state[0], fit.state[1] if len(fit.state) > 1 else np.zeros(3)
     freedom = fit.residual.size + (0 if prior is None else 3) - len(fit.information)
     chi2 = float(fit.square.sum()) + _deviation(R, prior)
-    angle = float(np.median(parallax(matched.only(inliers), R)))
-    return TwoView(kind, "", R, t, spread, inliers, chi2 / freedom, angle)
+    return TwoView(kind, "", R, t, spread, inliers, chi2 / freedom)
 
 
 def _rejection(kind: Kind, matched: MatchedPoints, agree: int, fit: PoseFit | None, prior: RotationPrior | None) -> str:

@@ -118,7 +118,7 @@ def _mean_covariance(found: Floats, matched: MatchedPoints, fit: PoseFit, prior:
     spread, axes = np.linalg.eigh(found)
     points = (np.sqrt(UNKNOWNS * np.maximum(spread, 0.0)) * axes).T
     steps = np.concatenate([points, -points])
-    turns = R @ Rotation.from_rotvec(steps[:, :3]).as_matrix()
+    turns = R @ exp(steps[:, :3])
     ways = np.stack([retract_direction(t, step[3:]) for step in steps])
     _, by_rotation, by_t = sampson(turns, ways, matched.xy0, matched.xy1)
     across = np.stack([tangent_basis(way) for way in ways])

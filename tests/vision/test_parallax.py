@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from view_pairs import FORWARD, NOWHERE, SIDEWAYS, SIGMA, view
 
 from smartnav_graph.vision.epipolar import sampson
-from smartnav_graph.vision.parallax import in_front, parallax, cheirality
+from smartnav_graph.vision.parallax import cheirality, in_front, parallax
 from smartnav_graph.vision.ransac import direction_by_samples
 from smartnav_graph.vision.refine import MatchedPoints
 

@@ -31,7 +31,7 @@ FACTORS, KEYFRAMES = "influence.parquet", "keyframes.parquet"
 
 
 class Group(NamedTuple):
-    """Factors of one shape: t_ns (g,), row (g,) in their stream or -1, keys (g, k), whitened [J b] (g, m, width + 1)"""
+    """Factors of one shape: t_ns (g,), row (g,) of a stream or -1, keys (g, k), whitened [J b] (g, m, width + 1)."""
 
     sensor: str
     t_ns: Times
