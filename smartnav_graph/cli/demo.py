@@ -33,13 +33,13 @@ class Demo(Command):
 
     def run(self) -> None:
         claim(self.out)
-        session = save(readers.read("gtsam-kitti"), self.out / "kitti")
+        session = write_over(readers.read("gtsam-kitti"), self.out / "kitti")
         print(f"KITTI drive: {len(session.require_imu())} inertial samples")
         self._smooth(session, Config(), self.out / "kitti-run")
         print(f"\nThe same with one fix in ten ({KEPT}); the other nine are only scored:")
         kept = replace(Config(), run=RunConfig(withhold=(KEPT,)))
         self._smooth(session, kept, self.out / "kitti-withheld", brief=True)
-        euroc = save(readers.read("gtsam-euroc"), self.out / "euroc")
+        euroc = write_over(readers.read("gtsam-euroc"), self.out / "euroc")
         print("\nEuRoC half minute: no position at all, a camera that starts from a standstill:")
         self._smooth(euroc, Config(), self.out / "euroc-run")
         print(f"\nopen {self.out / 'kitti-run' / 'report.html'} in a browser")
@@ -64,7 +64,7 @@ def claim(out: Path) -> None:
         raise SessionError(out, f"cannot be written ({error.strerror})", "a writable place") from error
 
 
-def save(session: Session, path: Path) -> Session:
+def write_over(session: Session, path: Path) -> Session:
     """Write a session folder over an older one."""
     session_folder.save(session, path, force=True)
     return session.replace(path=path)

@@ -65,7 +65,7 @@ class _Told:
 
     def __str__(self) -> str:
         passed = time.perf_counter() - self.begun
-        return counted(self.done, self.total, passed) if self.total else duration(passed)
+        return counted(self.done, self.total, passed) if self.total else time_text(passed)
 
 
 def counted(done: int, total: int, seconds: float) -> str:
@@ -74,10 +74,10 @@ def counted(done: int, total: int, seconds: float) -> str:
         return f"{done} of {total}"
     rate = done / seconds
     speed = f"{rate:.0f}" if rate >= 100 else f"{rate:.3g}"
-    return f"{done} of {total}, {speed}/s, {duration((total - done) / rate)} left"
+    return f"{done} of {total}, {speed}/s, {time_text((total - done) / rate)} left"
 
 
-def duration(seconds: float) -> str:
+def time_text(seconds: float) -> str:
     """Seconds for people: ``2 s``, ``3 min 05 s``, ``1 h 02 min``."""
     whole = round(seconds)
     if whole < 60:

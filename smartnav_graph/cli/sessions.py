@@ -48,7 +48,7 @@ class Import(Writing):
     def run(self) -> None:
         from smartnav_graph import readers
 
-        check_out(self.out, self.force)
+        check_session_out(self.out, self.force)
         with progress(self.quiet) as show:
             show(f"reading {self.source}", 0, 0)
             session = readers.read(self.source, self.format, repairs(self.repair))
@@ -97,11 +97,11 @@ class Simulate(Writing):
     def run(self) -> None:
         from smartnav_graph.simulation import recording, scenarios
 
-        check_out(self.out, self.force)
-        scenario = scenarios.named(self.scenario)
+        check_session_out(self.out, self.force)
+        scenario = scenarios.find_scenario(self.scenario)
         with progress(self.quiet) as show:
-            session = recording.write(scenario, self.seed, self.out, force=self.force, progress=show)
-        for name, value in recording.constants(scenario).items():
+            session = recording.write_recording(scenario, self.seed, self.out, force=self.force, progress=show)
+        for name, value in recording.scenario_constants(scenario).items():
             print(f"{name} = {value}")
         print(session_text(session))
         print(f"session: {self.out}")
@@ -139,7 +139,7 @@ class DegradeSession(Writing):
         from smartnav_graph import readers
         from smartnav_graph.simulation import degrade as rules
 
-        check_out(self.out, self.force)
+        check_session_out(self.out, self.force)
         options = rules.Degrade(
             gnss_white=self.gnss_white,
             gnss_gm=None if self.gnss_gm is None else rules.parse_pair(self.gnss_gm, "--gnss-gm"),
@@ -176,7 +176,7 @@ class View(Command):
         view(self.paths, self.web)
 
 
-def check_out(path: Path, force: bool) -> None:
+def check_session_out(path: Path, force: bool) -> None:
     """Raise unless a session may be written to `path`: a free place, or with `force` an older session."""
     refuse_existing(path, force)
     refuse_foreign(path, HEADER)

@@ -80,7 +80,7 @@ class PictureModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraModel:
+class SimulatedCamera:
     """A camera and what is kept of its images.
 
     camera, mount : as the session is told; rate_hz : of images; scene : made anew for each seed
@@ -124,7 +124,7 @@ class CameraModel:
         return rotation, body.nav_t_body + body.nav_R_body @ np.asarray(self.mount.body_t)
 
 
-class View(NamedTuple):
+class Projection(NamedTuple):
     """Points of the scene (k,) that a frame shows, and where, exactly: pixels (k, 2)."""
 
     rows: Rows
@@ -141,16 +141,16 @@ class Taken:
 
 
 def take(
-    model: CameraModel, trajectory: Trajectory, t_ns: Times, t: Floats, scene: Scene, rng: np.random.Generator
+    model: SimulatedCamera, trajectory: Trajectory, t_ns: Times, t: Floats, scene: Scene, rng: np.random.Generator
 ) -> Taken:
     """Images at the stamps t_ns (n,), at times t (n,) s of the trajectory, and the features in them."""
     images = _images(model, t_ns)
     if not (model.pairs or model.tracked):
         return Taken(images, None, None)
-    views = [view(model, trajectory, scene, float(at)) for at in t]
+    views = [project(model, trajectory, scene, float(at)) for at in t]
     jumps = _jumps(model, t, rng)
     blind = _blind(model, t)
-    views = [View(v.rows[:0], v.xy_px[:0]) if dark else v for v, dark in zip(views, blind, strict=True)]
+    views = [Projection(v.rows[:0], v.xy_px[:0]) if dark else v for v, dark in zip(views, blind, strict=True)]
     matches = _matches(model, views, jumps, t_ns, rng) if model.pairs else None
     return Taken(images, matches, _tracks(model, views, jumps, t_ns, rng) if model.tracked else None)
 
@@ -160,7 +160,7 @@ def file_name(image_id: int) -> str:
     return f"{image_id:06d}.png"
 
 
-def _images(model: CameraModel, t_ns: Times) -> Images:
+def _images(model: SimulatedCamera, t_ns: Times) -> Images:
     ids = np.arange(len(t_ns))
     files = [file_name(i) if model.pictures else "" for i in range(len(ids))]
     exposure, readout = model.pictures.exposure_s if model.pictures else 0.0, model.camera.readout_s
@@ -174,7 +174,7 @@ def _images(model: CameraModel, t_ns: Times) -> Images:
     )
 
 
-def view(model: CameraModel, trajectory: Trajectory, scene: Scene, t: float) -> View:
+def project(model: SimulatedCamera, trajectory: Trajectory, scene: Scene, t: float) -> Projection:
     """What the frame stamped `t` s shows, exactly."""
     camera = model.camera
     begin = t + model.offset_s
@@ -187,7 +187,7 @@ def view(model: CameraModel, trajectory: Trajectory, scene: Scene, t: float) -> 
         rotation, centres = model.poses(trajectory, at)
         xy = camera.pixels(_flat(rotate_back(rotation, points - centres)))
     inside = ((xy >= 0.0) & (xy <= [camera.width - 1, camera.height - 1])).all(axis=1)
-    return View(rows[inside], xy[inside])
+    return Projection(rows[inside], xy[inside])
 
 
 def _flat(points: Floats) -> Floats:
@@ -195,7 +195,7 @@ def _flat(points: Floats) -> Floats:
     return np.asarray(points[:, :2] / points[:, 2:])
 
 
-def _in_sight(model: CameraModel, R: Floats, centre: Floats, scene: Scene) -> Rows:
+def _in_sight(model: SimulatedCamera, R: Floats, centre: Floats, scene: Scene) -> Rows:
     """Points in front, within range, and not far beyond the corners of the image, where distortion would fold them in.
 
     The margin leaves room for what moves while a rolling shutter reads out.
@@ -210,7 +210,7 @@ def _in_sight(model: CameraModel, R: Floats, centre: Floats, scene: Scene) -> Ro
     return np.asarray(rows[inside], dtype=np.intp)
 
 
-def _jumps(model: CameraModel, t: Floats, rng: np.random.Generator) -> Floats:
+def _jumps(model: SimulatedCamera, t: Floats, rng: np.random.Generator) -> Floats:
     """Glitches (n, 2) px, by which all features of a frame are off."""
     jumps = np.zeros((len(t), 2))
     for at, size in model.faults.glitches:
@@ -219,19 +219,19 @@ def _jumps(model: CameraModel, t: Floats, rng: np.random.Generator) -> Floats:
     return jumps
 
 
-def _blind(model: CameraModel, t: Floats) -> NDArray[np.bool_]:
+def _blind(model: SimulatedCamera, t: Floats) -> NDArray[np.bool_]:
     blind = np.zeros(len(t), dtype=bool)
     for start, length in model.faults.blind:
         blind |= (t >= start) & (t < start + length)
     return blind
 
 
-def _noisy(model: CameraModel, xy_px: Floats, rng: np.random.Generator) -> Floats:
+def _noisy(model: SimulatedCamera, xy_px: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(xy_px + model.camera.noise_px * rng.standard_normal(xy_px.shape))
 
 
 def _matches(
-    model: CameraModel, views: Sequence[View], jumps: Floats, t_ns: Times, rng: np.random.Generator
+    model: SimulatedCamera, views: Sequence[Projection], jumps: Floats, t_ns: Times, rng: np.random.Generator
 ) -> Matches | None:
     """Matches of images so many apart as `pairs` says."""
     found = [
@@ -257,7 +257,7 @@ def _matches(
 
 
 def _pair(
-    model: CameraModel, one: View, other: View, rng: np.random.Generator
+    model: SimulatedCamera, one: Projection, other: Projection, rng: np.random.Generator
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Pixels (m, 2) in both images and whether they are the same point: a wrong match takes another point of the
     second image."""
@@ -272,7 +272,7 @@ def _pair(
 
 
 def _tracks(
-    model: CameraModel, views: Sequence[View], jumps: Floats, t_ns: Times, rng: np.random.Generator
+    model: SimulatedCamera, views: Sequence[Projection], jumps: Floats, t_ns: Times, rng: np.random.Generator
 ) -> Tracks | None:
     """Tracks that live until their point is out of sight or lost; new ones fill the frame to its number."""
     seen = list(_followed(model, views, rng))
@@ -294,7 +294,9 @@ def _tracks(
     )
 
 
-def _followed(model: CameraModel, views: Sequence[View], rng: np.random.Generator) -> Iterator[tuple[Rows, Floats]]:
+def _followed(
+    model: SimulatedCamera, views: Sequence[Projection], rng: np.random.Generator
+) -> Iterator[tuple[Rows, Floats]]:
     """Track numbers (k,) and exact pixels (k, 2) in each frame."""
     points, ids, fresh = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for shown in views:

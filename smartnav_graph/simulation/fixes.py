@@ -159,7 +159,9 @@ def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np
     return fix
 
 
-def pose_fixes(truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame, rng: np.random.Generator) -> PoseFix:
+def simulate_pose_fixes(
+    truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame, rng: np.random.Generator
+) -> PoseFix:
     """Pose fixes of the body at `truth` (one row a fix): the attitude is Exp(error) nav_R_body, error in nav axes."""
     n = len(t_ns)
     enu = truth.nav_t_body + model.sigma_m * rng.standard_normal((n, 3))

@@ -28,7 +28,7 @@ from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod
 from smartnav_graph.simulation import cameras, fixes, render, sensors
-from smartnav_graph.simulation.cameras import CameraModel
+from smartnav_graph.simulation.cameras import SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
@@ -61,7 +61,7 @@ class Scenario:
     wheel: SpeedModel | None = None
     velocity: SpeedModel | None = None
     pose_fixes: PoseFixModel | None = None
-    camera: CameraModel | None = None
+    camera: SimulatedCamera | None = None
     rest_sigma_m_s: float = 0.01
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
@@ -156,10 +156,10 @@ def _pose_fixes(ride: _Ride, model: PoseFixModel | None) -> PoseFix | None:
     if model is None:
         return None
     at = np.searchsorted(ride.t, np.arange(model.first_s, ride.t[-1], model.every_s) - 1e-9)
-    return fixes.pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
+    return fixes.simulate_pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
 
 
-def _camera(ride: _Ride, model: CameraModel | None) -> dict[str, Stream | None]:
+def _camera(ride: _Ride, model: SimulatedCamera | None) -> dict[str, Stream | None]:
     if model is None:
         return {}
     scene, every = model.scene(ride.rng("scene")), ride.rows(model.rate_hz)
@@ -168,7 +168,7 @@ def _camera(ride: _Ride, model: CameraModel | None) -> dict[str, Stream | None]:
     return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
 
 
-def write(
+def write_recording(
     scenario: Scenario, seed: int, path: str | Path, *, force: bool = False, progress: Progress = silent
 ) -> Session:
     """The scenario's session as a folder, with its pictures where it renders some; gives the session.
@@ -186,7 +186,7 @@ def write(
         session_folder.save(recorded, folder, progress=progress)
         if scenario.camera is not None and scenario.camera.pictures is not None:
             assert recorded.images is not None  # of the camera
-            render.write(folder / "images", shots(scenario, seed), len(recorded.images), progress)
+            render.write_pictures(folder / "images", shots(scenario, seed), len(recorded.images), progress)
     return recorded
 
 
@@ -197,10 +197,10 @@ def shots(scenario: Scenario, seed: int) -> Iterator[render.Grey]:
         raise ConfigError("simulate", f"{scenario.name} renders no pictures", "a scenario whose camera does")
     painted = render.Painted.of(model.scene(ride.rng("scene")), model.pictures, ride.rng("texture"))
     t = ride.t[ride.rows(model.rate_hz)]
-    yield from render.pictures(model, ride.trajectory, painted, t, model.pictures, ride.rng("pictures"))
+    yield from render.render_pictures(model, ride.trajectory, painted, t, model.pictures, ride.rng("pictures"))
 
 
-def constants(scenario: Scenario) -> dict[str, Any]:
+def scenario_constants(scenario: Scenario) -> dict[str, Any]:
     """Every constant of a scenario by its dotted name, and the noise of its device: what makes it, but for the seed."""
     noise = dataclasses.asdict(PROFILES[scenario.profile].noise)
     return _flat("", dataclasses.asdict(scenario) | {"noise": noise})

@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.session.calibration.camera import Camera
-from smartnav_graph.simulation.cameras import CameraModel, PictureModel, file_name
+from smartnav_graph.simulation.cameras import PictureModel, SimulatedCamera, file_name
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
 
@@ -76,7 +76,7 @@ def _texture(size_m: tuple[float, float], model: PictureModel, rng: np.random.Ge
     return np.asarray(np.clip(0.5 + 0.25 * model.contrast * spread / spread.std(), 0.0, 1.0))
 
 
-def rays(camera: Camera) -> Floats:
+def pixel_rays(camera: Camera) -> Floats:
     """Direction (h, w, 3) of every pixel's ray in optical axes, z = 1."""
     y, x = np.mgrid[: camera.height, : camera.width]
     flat = camera.normalised(np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64))
@@ -105,9 +105,9 @@ def _cast(scene: Scene, centre: Floats, ray: Floats) -> _Hit:
 
 
 def picture(
-    model: CameraModel, trajectory: Trajectory, painted: Painted, ray: Floats, t: float, how: PictureModel
+    model: SimulatedCamera, trajectory: Trajectory, painted: Painted, ray: Floats, t: float, how: PictureModel
 ) -> Floats:
-    """The frame stamped `t` s without noise: brightness (h, w), 0 .. 1; `ray` as `rays` gives it."""
+    """The frame stamped `t` s without noise: brightness (h, w), 0 .. 1; `ray` as `pixel_rays` gives it."""
     steps = how.blur_steps if how.exposure_s > 0 else 1
     within = (np.arange(steps) + 0.5) / steps - 0.5
     rows = t + model.offset_s + model.camera.readout_s * np.arange(model.camera.height) / (model.camera.height - 1)
@@ -118,17 +118,22 @@ def picture(
     return total / steps
 
 
-def pictures(
-    model: CameraModel, trajectory: Trajectory, painted: Painted, t: Floats, how: PictureModel, rng: np.random.Generator
+def render_pictures(
+    model: SimulatedCamera,
+    trajectory: Trajectory,
+    painted: Painted,
+    t: Floats,
+    how: PictureModel,
+    rng: np.random.Generator,
 ) -> Iterator[Grey]:
     """The frames stamped t (n,) s as the sensor gives them, (h, w) of 0 .. 255."""
-    ray = rays(model.camera)
+    ray = pixel_rays(model.camera)
     for at in t:
         exact = 255.0 * picture(model, trajectory, painted, ray, float(at), how)
         yield np.clip(np.rint(exact + how.noise * rng.standard_normal(exact.shape)), 0, 255).astype(np.uint8)
 
 
-def write(folder: Path, shots: Iterator[Grey], count: int, progress: Progress = silent) -> None:
+def write_pictures(folder: Path, shots: Iterator[Grey], count: int, progress: Progress = silent) -> None:
     """`count` pictures as numbered PNG files."""
     import cv2
 

@@ -21,7 +21,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation import motions
-from smartnav_graph.simulation.cameras import LOOKING_AHEAD, CameraModel, Faults, PictureModel
+from smartnav_graph.simulation.cameras import LOOKING_AHEAD, Faults, PictureModel, SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
 from smartnav_graph.simulation.recording import Scenario
 from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
@@ -80,7 +80,7 @@ PHONE_CAMERA = Camera(
 ).resized(640, 480)
 _ON_PHONE = Mount(body_t=(0.02, 0.05, -0.01), body_R=LOOKING_AHEAD)
 
-_ROOM = CameraModel(
+_ROOM = SimulatedCamera(
     camera=replace(PHONE_CAMERA, noise_px=0.5),
     mount=_ON_PHONE,
     scene=FurnishedRoom(size_m=(8.0, 6.0, 3.0), centre_m=(-1.5, 0.4, 0.2)),
@@ -91,7 +91,7 @@ _ROOM = CameraModel(
 )
 _RENDERED = replace(_ROOM, tracked=False, pictures=PictureModel())
 _TROLLEY = motions.Corridors()
-_CORRIDORS = CameraModel(
+_CORRIDORS = SimulatedCamera(
     camera=PHONE_CAMERA,
     mount=_ON_PHONE,
     scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
@@ -159,10 +159,10 @@ def simulate(name: str, seed: int = 0, *, calibrated: bool = True) -> Session:
     ConfigError
         Unknown name.
     """
-    return named(name)(seed, calibrated=calibrated)
+    return find_scenario(name)(seed, calibrated=calibrated)
 
 
-def named(name: str) -> Scenario:
+def find_scenario(name: str) -> Scenario:
     """The scenario of this name.
 
     Raises

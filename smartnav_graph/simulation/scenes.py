@@ -90,7 +90,7 @@ class Scene:
         return rows
 
 
-def build(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
+def make_scene(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
     """The faces of the boxes, with `per_m2` points a square metre scattered evenly where nothing covers them."""
     faces = np.concatenate([_faces(box) for box in boxes])
     corner, u, v = faces[:, 0], faces[:, 1], faces[:, 2]
@@ -143,7 +143,7 @@ class FurnishedRoom:
         for k in range(5):
             size = rng.uniform(0.6, 1.4), rng.uniform(0.3, 0.6), rng.uniform(0.6, 1.8)
             boxes.append(_along_wall(low, high, k % 4, rng.uniform(0.15, 0.75), size))
-        return build(boxes, self.per_m2, rng)
+        return make_scene(boxes, self.per_m2, rng)
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class CorridorGrid:
         for k in range(self.cupboards):
             size = rng.uniform(0.8, 2.0), 0.35, rng.uniform(0.8, 2.0)
             boxes.append(_along_wall(low, high, k % 4, rng.uniform(0.05, 0.95), size))
-        return build(boxes, self.per_m2, rng)
+        return make_scene(boxes, self.per_m2, rng)
 
 
 def _along_wall(low: Floats, high: Floats, side: int, share: float, size: tuple[float, float, float]) -> Box:

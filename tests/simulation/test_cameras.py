@@ -13,7 +13,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation import cameras, motions
-from smartnav_graph.simulation.cameras import CameraModel, Faults
+from smartnav_graph.simulation.cameras import Faults, SimulatedCamera
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.simulation.scenes import FurnishedRoom
 
@@ -26,7 +26,7 @@ def recorded(seed: int = 0, seconds: float = 12.0, **changes: object) -> sn.Sess
     return replace(ROOM, seconds=seconds, camera=replace(EXACT, **changes))(seed)
 
 
-def relative(session: sn.Session, model: CameraModel, matches: object) -> tuple[np.ndarray, np.ndarray]:
+def relative(session: sn.Session, model: SimulatedCamera, matches: object) -> tuple[np.ndarray, np.ndarray]:
     """True c0_R_c1 and c0_t_c1 of each match, by the exact motion."""
     trajectory = motions.in_a_room(12.0, np.random.default_rng(0))
     pose = [model.poses(trajectory, session.seconds(t) + model.offset_s) for t in (matches.t_ns, matches.t_1_ns)]
@@ -35,7 +35,7 @@ def relative(session: sn.Session, model: CameraModel, matches: object) -> tuple[
     return back @ R1, np.einsum("nij,nj->ni", back, p1 - p0)
 
 
-def misses(session: sn.Session, model: CameraModel = EXACT) -> tuple[np.ndarray, np.ndarray]:
+def misses(session: sn.Session, model: SimulatedCamera = EXACT) -> tuple[np.ndarray, np.ndarray]:
     """Whitened distance (n,) of every match from the true epipolar geometry, and the length of the baseline."""
     found = session.matches
     R, t = relative(session, model, found)
@@ -61,7 +61,7 @@ def test_the_camera_sees_what_projection_by_hand_says():
     alone = replace(
         alone, corner=p[None] + nav_R_body @ [0, 9.0, 0], u=nav_R_body[None, :, 0], v=nav_R_body[None, :, 2]
     )
-    shown = cameras.view(model, trajectory, alone, 7.0)
+    shown = cameras.project(model, trajectory, alone, 7.0)
     flat = np.array([[1.0 / 2.0, -0.5 / 2.0]])
     np.testing.assert_allclose(shown.xy_px, model.camera.pixels(flat), atol=1e-9)
     assert session.sensors["cam0"] == model.mount and session.calibration.cameras == {"cam0": model.camera}
@@ -148,15 +148,15 @@ def test_rows_of_a_rolling_shutter_show_their_own_time():
     rolling = replace(EXACT, camera=replace(EXACT.camera, readout_s=0.03))
     trajectory = motions.in_a_room(12.0, np.random.default_rng(0))
     scene = EXACT.scene(np.random.default_rng(3))
-    shown = cameras.view(rolling, trajectory, scene, 8.0)
+    shown = cameras.project(rolling, trajectory, scene, 8.0)
     moved = []
     for row, xy in list(zip(shown.rows, shown.xy_px, strict=True))[::40]:
         at = 8.0 + 0.03 * xy[1] / (EXACT.camera.height - 1)
-        still = cameras.view(EXACT, trajectory, scene, at)
+        still = cameras.project(EXACT, trajectory, scene, at)
         there = still.xy_px[still.rows == row]
         if len(there):
             np.testing.assert_allclose(there[0], xy, atol=0.01)  # px
-            first = cameras.view(EXACT, trajectory, scene, 8.0)
+            first = cameras.project(EXACT, trajectory, scene, 8.0)
             moved += [np.linalg.norm(first.xy_px[first.rows == row][0] - xy)] if (first.rows == row).any() else []
     assert max(moved) > 2.0
 
@@ -196,7 +196,7 @@ def test_nonsense_is_refused(make, text):
 
 
 def test_a_camera_before_a_bare_wall_sees_nothing_behind_it():
-    small = CameraModel(
+    small = SimulatedCamera(
         camera=Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0),
         scene=FurnishedRoom((2.0, 2.0, 2.0), per_m2=1.0),
         tracked=True,

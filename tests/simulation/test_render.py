@@ -13,9 +13,9 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.simulation import cameras, recording, render
-from smartnav_graph.simulation.cameras import CameraModel, PictureModel
+from smartnav_graph.simulation.cameras import PictureModel, SimulatedCamera
 from smartnav_graph.simulation.scenarios import SCENARIOS
-from smartnav_graph.simulation.scenes import Box, Scene, build
+from smartnav_graph.simulation.scenes import Box, Scene, make_scene
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 
 SCENARIO = SCENARIOS["rendered-room-10s"]
@@ -32,7 +32,7 @@ def painted():
 
 @pytest.fixture(scope="module")
 def ray():
-    return render.rays(MODEL.camera)
+    return render.pixel_rays(MODEL.camera)
 
 
 def shot(painted, ray, t, model=MODEL, how=CLEAN):
@@ -71,7 +71,7 @@ def test_what_detectors_match_agrees_with_the_true_motion(painted, ray, make):
 
 def test_pixels_and_points_agree(painted, ray):
     """A point of the cloud lies on the face, and at the place of it, that its pixel sees."""
-    shown = cameras.view(MODEL, TRAJECTORY, SCENE, 7.0)
+    shown = cameras.project(MODEL, TRAJECTORY, SCENE, 7.0)
     R, centre = MODEL.poses(TRAJECTORY, np.full(480, 7.0))
     hit = render._cast(SCENE, centre, ray @ np.swapaxes(R, 1, 2))
     x, y = np.rint(shown.xy_px).astype(int).T
@@ -96,17 +96,17 @@ def turning(rate_deg_s: float) -> Trajectory:
     return Trajectory(Legs([Leg(1.0, 0.0, rate_deg_s / 1.875)]))
 
 
-def wall(ray_model: CameraModel) -> tuple[Scene, render.Painted]:
-    scene = build([Box((-3.0, -3.0, -2.0), (3.0, 3.0, 2.0), inward=True)], 1.0, np.random.default_rng(0))
+def wall(ray_model: SimulatedCamera) -> tuple[Scene, render.Painted]:
+    scene = make_scene([Box((-3.0, -3.0, -2.0), (3.0, 3.0, 2.0), inward=True)], 1.0, np.random.default_rng(0))
     return scene, render.Painted.of(scene, CLEAN, np.random.default_rng(5))
 
 
 def test_blur_smears_along_the_turn_and_only_along_it():
     """40 deg/s to the left over 50 ms: 2 deg, or 17 px of 500 px focal length, sideways."""
     camera = Camera(width=320, height=240, fx=500.0, fy=500.0, cx=159.5, cy=119.5)
-    model = CameraModel(camera=camera, scene=MODEL.scene)
+    model = SimulatedCamera(camera=camera, scene=MODEL.scene)
     _, painted = wall(model)
-    ray = render.rays(camera)
+    ray = render.pixel_rays(camera)
     still, blurred = (
         render.picture(model, turning(40.0), painted, ray, 0.5, replace(CLEAN, exposure_s=s, blur_steps=16))
         for s in (0.0, 0.05)
@@ -121,7 +121,7 @@ def test_blur_smears_along_the_turn_and_only_along_it():
 def test_noise_is_white_and_as_told(painted, ray):
     how = replace(CLEAN, noise=3.0)
     exact = 255 * render.picture(MODEL, TRAJECTORY, painted, ray, 7.0, how)
-    (noisy,) = render.pictures(MODEL, TRAJECTORY, painted, np.array([7.0]), how, np.random.default_rng(2))
+    (noisy,) = render.render_pictures(MODEL, TRAJECTORY, painted, np.array([7.0]), how, np.random.default_rng(2))
     inside = (exact > 15) & (exact < 240)
     off = (noisy - exact)[inside]
     assert off.std() == pytest.approx(np.hypot(3.0, np.sqrt(1 / 12)), rel=0.01) and abs(off.mean()) < 0.05
@@ -136,7 +136,7 @@ def test_textures_use_the_grey_levels_and_differ_by_seed():
 
 def test_a_written_scenario_has_its_pictures(tmp_path):
     short = replace(SCENARIO, seconds=0.4)
-    made = recording.write(short, 0, tmp_path / "s")
+    made = recording.write_recording(short, 0, tmp_path / "s")
     back = session_folder.load(tmp_path / "s")
     assert back.images.file.tolist() == made.images.file.tolist() == [f"{i:06d}.png" for i in range(4)]
     pictures = [cv2.imread(str(tmp_path / "s" / "images" / name), cv2.IMREAD_UNCHANGED) for name in back.images.file]

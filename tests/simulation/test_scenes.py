@@ -13,7 +13,7 @@ ROOM = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0), inward=True)
 
 
 def made(*boxes: Box, per_m2: float = 10.0) -> scenes.Scene:
-    return scenes.build(boxes, per_m2, np.random.default_rng(1))
+    return scenes.make_scene(boxes, per_m2, np.random.default_rng(1))
 
 
 def test_points_lie_evenly_on_their_faces():

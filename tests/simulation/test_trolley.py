@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.simulation.recording import constants
+from smartnav_graph.simulation.recording import scenario_constants
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.simulation.sensors import PROFILES
 
@@ -76,7 +76,7 @@ def truth():
 
 
 def test_its_constants_are_frozen():
-    found = constants(TROLLEY)
+    found = scenario_constants(TROLLEY)
     assert {name: found[name] for name in FROZEN} == FROZEN
 
 
