@@ -100,7 +100,7 @@ class Simulate(Writing):
         check_session_out(self.out, self.force)
         scenario = scenarios.find_scenario(self.scenario)
         with progress(self.quiet) as show:
-            session = recording.write_recording(scenario, self.seed, self.out, force=self.force, progress=show)
+            session = recording.simulate_to_folder(scenario, self.seed, self.out, force=self.force, progress=show)
         for name, value in recording.scenario_constants(scenario).items():
             print(f"{name} = {value}")
         print(session_text(session))

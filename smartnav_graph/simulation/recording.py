@@ -168,7 +168,7 @@ def _camera(ride: _Ride, model: SimulatedCamera | None) -> dict[str, Stream | No
     return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
 
 
-def write_recording(
+def simulate_to_folder(
     scenario: Scenario, seed: int, path: str | Path, *, force: bool = False, progress: Progress = silent
 ) -> Session:
     """The scenario's session as a folder, with its pictures where it renders some; gives the session.

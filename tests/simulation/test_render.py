@@ -136,7 +136,7 @@ def test_textures_use_the_grey_levels_and_differ_by_seed():
 
 def test_a_written_scenario_has_its_pictures(tmp_path):
     short = replace(SCENARIO, seconds=0.4)
-    made = recording.write_recording(short, 0, tmp_path / "s")
+    made = recording.simulate_to_folder(short, 0, tmp_path / "s")
     back = session_folder.load(tmp_path / "s")
     assert back.images.file.tolist() == made.images.file.tolist() == [f"{i:06d}.png" for i in range(4)]
     pictures = [cv2.imread(str(tmp_path / "s" / "images" / name), cv2.IMREAD_UNCHANGED) for name in back.images.file]
