@@ -6,10 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import gtsam
+
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.core.progress import Progress, silent
-from smartnav_graph.estimate.alignment.initial_state import InitialState, UserStart
-from smartnav_graph.estimate.alignment.inputs import initialiser_of
+from smartnav_graph.estimate.alignment.initial_state import InitialState
+from smartnav_graph.estimate.alignment.initialiser import find_initial_state
+from smartnav_graph.estimate.alignment.inputs import first_stretch
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import Clock, causal_start, solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
@@ -51,18 +54,15 @@ class Run:
 
 
 def initialise(problem: Problem, longest_s: float | None = None) -> InitialState:
-    """First state of a problem; `longest_s` bounds the stretch it may look at."""
+    """First state of a problem; `longest_s` bounds the stretch it is found on (replay)."""
 
     def solve(
-        prior: PriorBuilder, count: int, pass_state: PassState, initial_values: Any = None
+        prior: PriorBuilder, count: int, pass_state: PassState, initial_values: gtsam.Values | None
     ) -> tuple[Estimate, PassState]:
-        estimate, pass_state, _ = solve_passes(
-            problem, problem.windows[:count], prior, pass_state, initial_values=initial_values, coarse_start=True
-        )
-        return estimate, pass_state
+        windows = problem.windows[:count]
+        return solve_passes(problem, windows, prior, pass_state, initial_values=initial_values, coarse_start=True)[:2]
 
-    given = UserStart.parse(problem.config.run.initial) if problem.config.run.initial else None
-    return initialiser_of(problem, longest_s).run(solve, given)
+    return find_initial_state(first_stretch(problem, longest_s), solve)
 
 
 def smooth(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:

@@ -139,12 +139,14 @@ class MagnetometerBuilder(Builder):
         iron = np.asarray(self.noise.hard_iron_ut, dtype=np.float64)
         self.iron = SessionState("H", self.name, IRON, iron, np.full(3, self.iron_sigma))
         self.field = SessionState("F", self.name, STRENGTH, self.field_ut, self.field_sigma)
-        self.sure = self.iron_sigma
 
-    def begin(self, iron: Floats, sigma: float) -> None:
-        """Start from a hard iron (3,) uT that the first seconds tell to `sigma` uT. How sure it was beforehand stays
-        the sigma of its prior: the same samples are used again."""
-        self.iron, self.sure = replace(self.iron, initial=iron), min(sigma, self.iron_sigma)
+    def iron_at_start(self, pass_state: PassState) -> tuple[SessionState, float]:
+        """Hard iron as a state that begins where the alignment found it, and the sigma (uT) that it is known to. The
+        sigma of its prior stays as it was before: the same samples are used again."""
+        found = pass_state.aligned_states.get(IRON)
+        if found is None:
+            return self.iron, self.iron_sigma
+        return replace(self.iron, initial=found[0]), min(found[1], self.iron_sigma)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where it has samples and the gyro tells how they turned."""
@@ -157,9 +159,12 @@ class MagnetometerBuilder(Builder):
         y, turn = turned_mean(window, self.t_ns[rows], corrected, previous.bias.gyroscope())
         A = turn @ self.soft_iron
         sigma, shared = self.sigma(window.length_s, len(rows)), self.shared(window.length_s)
-        used = self._usable(pass_state) and not self.disturbed(update.predicted.attitude().matrix(), y, A, sigma)
+        iron, iron_sigma = self.iron_at_start(pass_state)
+        known = sigma**2 + self.field_sigma**2 + iron_sigma**2
+        level = update.predicted.attitude().matrix() @ (y - A @ iron.initial)
+        used = self.usable(pass_state) and not self.disturbed(level, known)
         data = np.concatenate([y, A.ravel(), [np.sin(self.declination), np.cos(self.declination), sigma]])
-        keys = (key("X", update.index), key("V", update.index), update.use(self.iron), update.use(self.field))
+        keys = (key("X", update.index), key("V", update.index), update.use(iron), update.use(self.field))
         loss, reach = self.config.loss, REACH / float(np.sqrt(shared))
         update.blocks.append(
             FactorBatch(self.name, MODEL, [keys], data[None], update.t_ns, (last - 1,), (used,), loss, reach)
@@ -178,21 +183,16 @@ class MagnetometerBuilder(Builder):
         on what one row is off by itself."""
         return max(1.0, 2.0 * self.noise.disturbance_s / length_s) if self.noise.disturbance_ut > 0 else 1.0
 
-    def _usable(self, pass_state: PassState) -> bool:
-        """A hard iron that is held although nobody knows it would pass for north."""
-        return self.speaks(pass_state.causal, IRON in pass_state.fixed_states)
+    def usable(self, pass_state: PassState) -> bool:
+        """Whether rows are used: a hard iron that is fixed although it is unknown would pass for north."""
+        fixed = IRON in pass_state.fixed_states or (pass_state.causal and self.held_in_replay)
+        return not fixed or self.iron_at_start(pass_state)[1] <= SURE_IRON_UT
 
-    def speaks(self, causal: bool, held: bool = False) -> bool:
-        """Whether rows are used in a replay (`causal`) or a batch run, the hard iron being held or not."""
-        held = held or (causal and self.held_in_replay)
-        return not held or self.sure <= SURE_IRON_UT
-
-    def disturbed(self, nav_R_body: Floats, y: Floats, A: Floats, sigma: float) -> bool:
-        """Whether intensity and dip, as horizontal and vertical strength, contradict field and hard iron as they are
-        known beforehand. Whatever the heading: it is the last thing to trust here."""
-        level = nav_R_body @ (y - A @ self.iron.initial)
+    def disturbed(self, level: Floats, variance: Floats) -> bool:
+        """Whether a field (3,) uT in level axes contradicts intensity and dip, as horizontal and vertical strength with
+        a variance (2,) uT^2 by sigmas of row, field and hard iron. Whatever its heading, which is tested last."""
         found = np.array([np.hypot(level[0], level[1]), level[2]])
-        known = sigma**2 + self.field_sigma**2 + self.sure**2 + (TILT * np.linalg.norm(level)) ** 2
+        known = variance + (TILT * np.linalg.norm(level)) ** 2
         return bool((np.abs(found - self.field_ut) > self.config.gate_sigmas * np.sqrt(known)).any())
 
 

@@ -40,6 +40,7 @@ class PassState:
     rejected : rows not used, by sensor
     correlated : sensors with a Gauss-Markov state for their correlated errors
     fixed_states : session states fixed at a value (d,), by name
+    aligned_states : value (d,) and sigma of session states that the alignment found, by name
     stage : a builder takes part from its own `stage` on
     phase : treatment of outliers
     outlier_tests : how often image pairs and tracks were tested against a solution, by builder
@@ -51,6 +52,7 @@ class PassState:
     rejected: Mapping[str, frozenset[int]] = field(default_factory=dict)
     correlated: frozenset[str] = frozenset()
     fixed_states: Mapping[str, Floats] = field(default_factory=dict)
+    aligned_states: Mapping[str, tuple[Floats, float]] = field(default_factory=dict)
     stage: int = 0
     phase: Phase = Phase.PLAIN
     outlier_tests: Mapping[str, int] = field(default_factory=dict)

@@ -200,11 +200,12 @@ def test_first_seconds_make_a_held_hard_iron_usable_and_leave_its_prior_as_wide_
     made = builder(iron_sigma=240.0, held_in_replay=True, reading=np.tile(NAV_FIELD + IRON, (100, 1)))
     causal = PassState(stage=1, phase=Phase.CAUSAL)
     assert step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks[0].used == (False,)
-    made.begin(IRON, 2.0)
-    (block,) = step_of(made, turning((0.0, 0.0, 0.0)), causal).blocks
+    aligned = replace(causal, aligned_states={"magnetometer_hard_iron_ut": (IRON, 2.0)})
+    (block,) = step_of(made, turning((0.0, 0.0, 0.0)), aligned).blocks
     assert block.used == (True,)
-    np.testing.assert_array_equal(made.iron.initial, IRON)
-    assert (made.iron.sigma == 240.0).all()
+    iron, sigma = made.iron_at_start(aligned)
+    np.testing.assert_array_equal(iron.initial, IRON)
+    assert (iron.sigma == 240.0).all() and sigma == 2.0
 
 
 def test_soft_iron_and_hard_iron_of_the_calibration_are_taken_out():

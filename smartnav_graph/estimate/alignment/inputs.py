@@ -1,72 +1,75 @@
-"""What a problem tells of its first state: its absolute positions and attitudes, a magnetometer, a walker's way."""
+"""A problem -> its first stretch: positions and attitudes, magnetic field, the path of a pedestrian, a rest."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.alignment.attitude import LONGEST_S, AttitudeStart, attitude_start
-from smartnav_graph.estimate.alignment.initialiser import Initialiser
+from smartnav_graph.estimate.alignment.first_stretch import FirstStretch, Fixes
+from smartnav_graph.estimate.alignment.initial_state import UserStart
 from smartnav_graph.estimate.alignment.magnetic import field_start
 from smartnav_graph.estimate.alignment.pedestrian import SPARSE_S, Walk, walked
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.reweight.outliers import position_builders
-from smartnav_graph.factors.magnetometer import MagnetometerBuilder
+from smartnav_graph.factors.magnetometer import IRON, MagnetometerBuilder
 from smartnav_graph.factors.pedestrian import StepBuilder
 from smartnav_graph.factors.pose_fix import AttitudeBuilder
+from smartnav_graph.graph.pass_state import PassState, Phase
+from smartnav_graph.graph.update import one_of
 
 
-def initialiser_of(problem: Problem, longest_s: float | None = None) -> Initialiser:
-    """The initialiser of a problem; `longest_s` bounds the stretch it may look at, and what it may know (replay)."""
+def first_stretch(problem: Problem, longest_s: float | None = None) -> FirstStretch:
+    """The first stretch of a problem; `longest_s` bounds its length, and what may be known of it (replay)."""
     session, config = problem.session, problem.config.initialise
     causal = longest_s is not None
     if longest_s is not None:
         most = min(config.max_stretch_s, longest_s)
         config = replace(config, max_stretch_s=most, stretch_s=min(config.stretch_s, most))
-    t_ns, positions, sources, known = _absolute_positions(problem)
-    return Initialiser(
+    fixes = absolute_positions(problem)
+    return FirstStretch(
         windows=problem.windows,
         imu=session.require_imu(),
-        fixes=(t_ns, positions),
-        sources=sources,
-        arrival_ns=known if causal else None,
+        fixes=fixes if causal else replace(fixes, available_ns=fixes.t_ns),
         fix_sigma=max((float(np.median(b.sigma)) for b in position_builders(problem.builders)), default=1.0),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
+        up=session.device.up,
         config=config,
         weak=problem.config.prior,
         standstill=problem.rests_at_start,
         attitude_start=_oriented(problem, causal=causal),
-        walk=_walked(problem, (t_ns, positions), known, config.max_stretch_s if causal else None),
+        walk=_walked(problem, fixes, config.max_stretch_s if causal else None),
         rest_end_ns=_standing(problem, config.rest_s),
+        user=UserStart.parse(problem.config.run.initial) if problem.config.run.initial else None,
         **_north(problem, causal=causal),
     )
 
 
 def _standing(problem: Problem, shortest_s: float) -> int | None:
-    """End of the standstill told of that the first keyframe lies in, if it lasts long enough."""
+    """End of the listed standstill that the first keyframe lies in, if it lasts long enough."""
     start = problem.windows[0].t1_ns
     spans = () if problem.rests is None else problem.rests.confirmed
     ends = [b for a, b in spans if a <= start < b and b - start >= shortest_s * NS]
     return ends[0] if ends else None
 
 
-def _walked(problem: Problem, fixes: tuple[Times, Floats], known: Times, causal_s: float | None) -> Walk | None:
-    """First sight of a walker's way, where fixes are far apart; by what is known after `causal_s` seconds."""
-    steps = next((b for b in problem.builders if isinstance(b, StepBuilder)), None)
-    if steps is None or len(fixes[0]) < 2 or float(np.median(np.diff(fixes[0]))) < SPARSE_S * NS:
+def _walked(problem: Problem, fixes: Fixes, causal_s: float | None) -> Walk | None:
+    """The rough path of a pedestrian, where fixes are far apart; by what is known after `causal_s` seconds."""
+    steps = one_of(problem.builders, StepBuilder)
+    if steps is None or len(fixes) < 2 or float(np.median(np.diff(fixes.t_ns))) < SPARSE_S * NS:
         return None
     end = problem.windows[-1].t1_ns if causal_s is None else problem.windows[0].t1_ns + int(causal_s * NS)
-    used, noise = known <= end, problem.calibration
+    used, noise = fixes.available_ns <= end, problem.calibration
     return walked(
         [window for window in problem.windows if window.t1_ns <= end],
         steps.steps,
-        (fixes[0][used], fixes[1][used]),
+        (fixes.t_ns[used], fixes.position[used]),
         max((float(np.median(b.sigma[:, :2])) for b in position_builders(problem.builders)), default=1.0),
         noise.imu_noise.gyro_bias_sigma,
         steps.model.body_R_vehicle,
@@ -76,7 +79,7 @@ def _walked(problem: Problem, fixes: tuple[Times, Floats], known: Times, causal_
 
 def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
     """Attitude and gyro bias at the start by the first pose fixes that have an attitude."""
-    builder = next((b for b in problem.builders if isinstance(b, AttitudeBuilder)), None)
+    builder = one_of(problem.builders, AttitudeBuilder)
     stream = problem.session.pose_fixes
     if builder is None or stream is None:
         return None
@@ -87,11 +90,11 @@ def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
 
 
 def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
-    """What the magnetometer says of the start, for the initialiser."""
-    builder = next((b for b in problem.builders if isinstance(b, MagnetometerBuilder)), None)
+    """Fields of the first stretch by the magnetometer."""
+    builder, phase = one_of(problem.builders, MagnetometerBuilder), Phase.CAUSAL if causal else Phase.PLAIN
     stream = problem.session.magnetometer
     if builder is None or stream is None:
-        return {"magnetometer": None, "declination_deg": 0.0}
+        return {}
     start = field_start(
         problem.session.require_imu(),
         stream,
@@ -101,25 +104,35 @@ def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
         builder.iron_sigma,
         builder.declination,
     )
-    if start is not None:
-        builder.begin(start.iron, start.iron_sigma)
+    found = PassState() if start is None else PassState(aligned_states={IRON: (start.iron, start.iron_sigma)})
     return {
         "magnetometer": stream,
         "declination_deg": problem.session.declination_deg,
         "iron_sigma": builder.iron_sigma,
-        "magnetic_stage": builder.stage if builder.speaks(causal) else None,
+        "magnetic_stage": builder.stage if builder.usable(replace(found, phase=phase)) else None,
         "field_start": start,
+        "pass_state": found,
     }
 
 
-def _absolute_positions(problem: Problem) -> tuple[Times, Floats, list[tuple[str, int]], Times]:
-    """Stamps, nav positions, sensor and row, and arrival of all absolute measurements, in time order."""
+def measured_positions(problem: Problem) -> Fixes:
+    """The positions of all streams that have some."""
     streams = problem.session.positions()
     if not streams:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), [], np.zeros(0, dtype=np.int64)
-    t = np.concatenate([stream.t_ns for stream in streams.values()])
-    p = np.concatenate([problem.session.nav_position(stream) for stream in streams.values()])
-    sources = [(name, row) for name, stream in streams.items() for row in range(len(stream))]
-    order = np.argsort(t, kind="stable")
-    known = np.concatenate([stream.available_ns for stream in streams.values()])
-    return t[order], p[order], [sources[i] for i in order], known[order]
+        return Fixes.none()
+    return Fixes(
+        np.concatenate([stream.t_ns for stream in streams.values()]),
+        np.concatenate([problem.session.nav_position(stream) for stream in streams.values()]),
+        np.concatenate([stream.available_ns for stream in streams.values()]),
+        [(name, row) for name, stream in streams.items() for row in range(len(stream))],
+    )
+
+
+# What gives the positions of the first stretch. A sensor whose rows give positions only together adds a function, which
+# gives none where the measured ones suffice.
+POSITIONS: Sequence[Callable[[Problem], Fixes]] = (measured_positions,)
+
+
+def absolute_positions(problem: Problem) -> Fixes:
+    """All positions, in time order."""
+    return Fixes.sorted([positions(problem) for positions in POSITIONS])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import gtsam
@@ -17,14 +16,10 @@ from smartnav_graph.core import frames
 from smartnav_graph.core.errors import ConfigError, SolverError
 from smartnav_graph.core.frames import magnetic_field_ut
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.estimate.alignment.initialiser import (
-    InitialiseConfig,
-    Initialiser,
-    UserStart,
-    find_rest,
-    inertial_curve,
-    kabsch_attitude,
-)
+from smartnav_graph.estimate.alignment.first_stretch import FirstStretch, Fixes
+from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig, InitialState, UserStart
+from smartnav_graph.estimate.alignment.initialiser import find_initial_state
+from smartnav_graph.estimate.alignment.static import find_rest, inertial_curve, kabsch_attitude
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.run import initialise
@@ -226,27 +221,25 @@ def test_config_names_what_is_wrong(wrong):
 # --- whole starts without a solver ------------------------------------------------------------------------------------
 
 
-def initialiser(session, *, fixes: bool = False, **changes) -> Initialiser:
-    t0 = session.t0_ns
-    at = t0 + ns_from_seconds(np.arange(0.0, 20.0))
-    gnss = session.gnss
+def started(session, **changes) -> InitialState:
+    """The first state of a session without its fixes."""
+    at = session.t0_ns + ns_from_seconds(np.arange(0.0, 20.0))
     values = {
         "windows": make_windows(session.imu, at, [], {}, KeyframeConfig(max_spacing_s=2.0)),
         "imu": session.imu,
-        "fixes": (gnss.t_ns, session.nav_position(gnss)) if fixes else (np.zeros(0, np.int64), np.zeros((0, 3))),
+        "fixes": Fixes.none(),
         "gravity": session.gravity,
         "noise": NOISE,
         "forward": session.device.forward,
+        "up": session.device.up,
         "magnetometer": session.magnetometer,
-        "declination_deg": 0.0,
         "config": InitialiseConfig(),
+        "fix_sigma": 3.0,
     }
-    names = {field.name for field in dataclasses.fields(Initialiser)}
-    values |= {"fix_sigma": 3.0} if "fix_sigma" in names else {}
-    return Initialiser(**{**values, **changes})
+    return find_initial_state(FirstStretch(**{**values, **changes}), no_solver)
 
 
-def no_solver(prior, count, pass_state):
+def no_solver(prior, count, pass_state, values):
     raise AssertionError("nothing to solve")
 
 
@@ -268,7 +261,7 @@ def test_a_rest_of_a_calibrated_device_gives_the_magnetic_heading_within_three_d
         hard_iron_sigma_ut=0.3,
     )
     session = recording.session.replace(magnetometer=mag)
-    start = initialiser(session, declination_deg=declination_deg()).run(no_solver, None)
+    start = started(session, declination_deg=declination_deg())
     assert start.method == "static" and "magnetometer" in start.sentence
     assert abs(wrap_deg(start.heading_deg - 40.0)) < 3.0
 
@@ -276,7 +269,7 @@ def test_a_rest_of_a_calibrated_device_gives_the_magnetic_heading_within_three_d
 @pytest.mark.parametrize("seed", range(5))
 def test_a_rest_of_a_phone_as_it_is_keeps_the_sigma_it_claims(seed):
     session = simulate("static-60s", seed)  # heading 40 deg, pitch 5 deg, roll -3 deg
-    start = initialiser(session, declination_deg=declination_deg(), iron_sigma=1.0).run(no_solver, None)
+    start = started(session, declination_deg=declination_deg(), iron_sigma=1.0)
     # 20 deg for iron nearby and 1 uT of the phone's own in 19 uT
     assert abs(wrap_deg(start.heading_deg - 40.0)) < start.sigma_heading_deg == pytest.approx(20.3, abs=0.3)
     R = start.prior.start.nav.attitude().matrix()
@@ -298,14 +291,14 @@ def test_the_magnetic_heading_of_an_exact_field(heading, roll, pitch):
     session = record().session.replace(imu=imu, magnetometer=mag, gnss=None, control=None)
     at = START_NS + ns_from_seconds(np.arange(0.0, 9.0))
     windows = make_windows(imu, at, [], {}, KeyframeConfig(max_spacing_s=2.0))
-    start = initialiser(session, windows=windows, declination_deg=declination_deg()).run(no_solver, None)
+    start = started(session, windows=windows, declination_deg=declination_deg())
     assert abs(wrap_deg(start.heading_deg - heading)) < 1e-6
     assert angle_deg(start.prior.start.nav.attitude().matrix(), R) < 1e-6
 
 
 def test_a_rest_alone_starts_at_zero_and_says_so():
     session = simulate("static-60s").replace(magnetometer=None)
-    start = initialiser(session).run(no_solver, None)
+    start = started(session)
     assert (start.heading_deg, start.sigma_heading_deg) == (0.0, 1e-3)
     assert start.sentence.startswith(
         "No absolute sensor: started from a rest of 29.5 s; heading and position set to zero"
@@ -319,17 +312,34 @@ def test_a_rest_alone_starts_at_zero_and_says_so():
 def test_neither_rest_nor_absolute_sensor_is_refused_with_the_way_out():
     session = record(motions.car(30.0, np.random.default_rng(5), start_speed=12.0)).session
     with pytest.raises(SolverError) as e:
-        initialiser(session).run(no_solver, None)
+        started(session)
     text = str(e.value)
     assert text.startswith("initialisation: no absolute sensor (no position fix, no control point) and no rest")
     assert 'give --initial "e,n,u,heading_deg"' in text
+
+
+def test_forward_may_be_the_axis_that_points_up_in_a_flat_device():
+    """A phone upright in a holder: forward out of its back, up its top edge."""
+    R = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()  # its top edge points up
+    n = 1000
+    t = START_NS + ns_from_seconds(np.arange(n) / 100)
+    imu = Imu(t_ns=t, accel=np.tile(R.T @ [0, 0, GRAVITY], (n, 1)), gyro=np.zeros((n, 3)))
+    mag = Magnetometer(t_ns=t, field_ut=np.tile(R.T @ magnetic_field_ut(ORIGIN, YEAR), (n, 1)))
+    session = record().session.replace(imu=imu, magnetometer=mag, gnss=None, control=None)
+    at = START_NS + ns_from_seconds(np.arange(0.0, 9.0))
+    windows = make_windows(imu, at, [], {}, KeyframeConfig(max_spacing_s=2.0))
+    start = started(session, windows=windows, forward="-z", up="+y", declination_deg=declination_deg())
+    assert start.heading_deg % 360.0 == pytest.approx(0.0, abs=1e-6)
+    device = replace(record().session.device, forward="-z", up="+y")
+    fixes = record(eight(30.0), noise=PHONE, fix_sigma=0.3, seed=2).session.replace(device=device)
+    assert np.isfinite(initialise(prepare(fixes, Config())).heading_deg)
 
 
 @pytest.mark.parametrize("resting", [False, True])
 def test_a_given_start_is_levelled_and_held_as_told(resting):
     motion = motions.static(30.0) if resting else motions.car(30.0, np.random.default_rng(5), start_speed=12.0)
     recording = record(motion)
-    start = initialiser(recording.session).run(no_solver, UserStart((1.0, 2.0, 3.0), 123.0, 0.5, 2.0))
+    start = started(recording.session, user=UserStart((1.0, 2.0, 3.0), 123.0, 0.5, 2.0))
     prior = start.prior
     assert start.method == "given" and start.heading_deg == 123.0
     assert ("levelled over a rest" in start.sentence) == resting
