@@ -29,7 +29,7 @@ from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
 from smartnav_graph.vision.pairs import Pairs
-from smartnav_graph.vision.zero_motion import still_periods
+from smartnav_graph.vision.zero_motion import static_periods
 
 # Why a row that replay was handed is not in its solution.
 TOO_LATE = "older than the lag"
@@ -111,7 +111,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     vehicle = config.run.vehicle or session.device.vehicle
     noise, still = calibration.imu_noise, config.standstill
     pairs = pairs_of(session, config.image_pairs, smart=config.smart.enabled)
-    seen = None if pairs is None else still_periods(pairs)
+    seen = None if pairs is None else static_periods(pairs)
     rests = find_standstills(imu, session.static, gaps, vehicle, noise, session.gravity, still, seen)
     context = FactorContext(
         *(session, calibration, gaps, vehicle, config, rests, causal, pairs),

@@ -30,7 +30,7 @@ from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowMo
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.gating import gate
-from smartnav_graph.vision.pairs import Pairs, of_matches, of_tracks
+from smartnav_graph.vision.pairs import Pairs, pairs_of_matches, pairs_of_tracks
 
 # How sure the turn between two images is, rad and rad/s: what is left of the gyro's bias and noise.
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
@@ -303,8 +303,8 @@ def pairs_of(session: Session, config: CoplanarityConfig, *, smart: bool = False
     if not (config.enabled or smart):
         return None
     if session.matches is not None:
-        return of_matches(session.matches)
-    return None if session.tracks is None else of_tracks(session.tracks, config.rate_hz, config.spans)
+        return pairs_of_matches(session.matches)
+    return None if session.tracks is None else pairs_of_tracks(session.tracks, config.rate_hz, config.spans)
 
 
 def build(context: FactorContext) -> CoplanarityBuilder | None:

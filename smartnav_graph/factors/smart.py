@@ -37,7 +37,7 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.vision.points import Sightings, of_tracks
+from smartnav_graph.vision.points import TrackObservations, observations_of_tracks
 
 # A track needs so many observations: with two, the point takes all but what a pair says.
 LEAST_SEEN = 3
@@ -85,7 +85,7 @@ class SmartBuilder(Builder):
     verdict (n,) : what became of each track, places in `REASONS`; refused : why none is used, in words
     """
 
-    sightings: Sightings
+    sightings: TrackObservations
     image_ns: NDArray[np.int64]
     rates: BodyRates
     camera_model: CameraModel
@@ -176,7 +176,7 @@ def build(context: FactorContext) -> SmartBuilder | None:
         raise ConfigError("config [smart]", found, expected, "leave replay.polish on, or smart off")
     camera_model = make_camera_model(context, context.options(CoplanarityConfig))
     return SmartBuilder(
-        of_tracks(tracks, pairs.t_ns, config.most_seen),
+        observations_of_tracks(tracks, pairs.t_ns, config.most_seen),
         context.image_ns,
         BodyRates(context.session.require_imu()),
         camera_model,

@@ -6,8 +6,8 @@ X0 = R X1 + t:
     e = x0~^T E x1~,  E = [t]x R,       l0 = E x1~,  l1 = E^T x0~
     r = e / s,        s^2 = l0_x^2 + l0_y^2 + l1_x^2 + l1_y^2 + floor^2
 
-r is the distance (to first order) by which the match misses the epipolar geometry, in normalised units; it does not
-depend on the length of t. The floor keeps pairs without a baseline harmless: there e and its derivatives vanish.
+r is the distance (to first order) of the match from the epipolar geometry, in normalised units; it does not depend on
+the length of t. With the floor, r and its derivatives vanish without a baseline.
 
 Source: Sampson (1982), Fitting conic sections to very scattered data; Luong, Faugeras (1996), The fundamental matrix,
 IJCV 17(1), 4.2.
@@ -41,18 +41,18 @@ def essential(R: Floats, t: Floats) -> Floats:
 
 
 def sampson(R: Floats, t: Floats, x0: Floats, x1: Floats, floor: float = 0.0, shift: Floats | None = None) -> Sampson:
-    """How far the matches of a pair, or of many pairs, miss the epipolar geometry of their cameras.
+    """Sampson residuals of the matches of a pair, or of many pairs.
 
     Parameters
     ----------
     R : (..., 3, 3) c0_R_c1; t : (..., 3) c0_t_c1, of which only the direction matters without a floor
     x0, x1 : (..., m, 2) undistorted normalised coordinates
-    floor : length in units of t, below which a baseline says little
-    shift : (..., m, 3) what the baseline of each match has beyond t, a constant
+    floor : length in units of t, below which a baseline has little weight
+    shift : (..., m, 3) baseline of each match less t, a constant
     """
     a, b, t, back = rays(x0), rays(x1), t[..., None, :], R
     t = t if shift is None else t + shift
-    R = np.swapaxes(R, -1, -2)  # x @ R turns rows
+    R = np.swapaxes(R, -1, -2)  # x @ R rotates rows
     y = b @ R
     l0 = cross(t, y)
     l1 = cross(a, t) @ back
@@ -76,5 +76,5 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def _flat(lines: Floats) -> Floats:
-    """Lines with their third component left out."""
+    """Lines with their third component set to zero."""
     return np.asarray(lines * np.array([1.0, 1.0, 0.0]))

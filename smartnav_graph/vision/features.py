@@ -1,14 +1,15 @@
-"""Points of interest with descriptors, by name: detector, descriptor and how descriptors are compared.
+"""Points of interest with descriptors: detectors and descriptors of OpenCV by name.
 
-The names with a plus (detector + descriptor) need the contrib modules of OpenCV. Every detector is asked for more
-points than wanted; the best of them are kept so that they cover the picture.
+The names with a plus (detector + descriptor) need the contrib modules of OpenCV. Every detector returns more points
+than needed; the best of them that cover the picture are used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,31 +19,35 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.vision.images import Gray
 
-# A detector is asked for so many times the points that are wanted.
+if TYPE_CHECKING:
+    import cv2
+
+# Points that a detector returns over those needed.
 SURPLUS = 2
-# Cells of the picture along its longer side, among which the points are spread.
+# Cells along the longer side of the picture, among which the points are distributed.
 CELLS = 16
 
 
 @dataclass(frozen=True)
 class Kind:
-    """How to make a detector (of the cv2 module and the number of points) and a descriptor; None: the same object.
+    """How to create a detector (of the cv2 module and the number of points) and a descriptor; None: the same object.
 
     at_once : detector and descriptor share a pyramid, and the detector keeps to the number of points
     """
 
-    detector: Callable[[Any, int], Any]
-    descriptor: Callable[[Any], Any] | None = None
+    detector: Callable[[ModuleType, int], cv2.Feature2D]
+    descriptor: Callable[[ModuleType], cv2.Feature2D] | None = None
     at_once: bool = False
 
 
-def _freak(cv2: Any) -> Any:
-    return cv2.xfeatures2d.FREAK_create()
+def _freak(opencv: ModuleType) -> cv2.Feature2D:
+    descriptor: cv2.Feature2D = opencv.xfeatures2d.FREAK_create()
+    return descriptor
 
 
-# Thresholds are low: the strongest points are taken, however weak the texture is. ORB places its points on whole pixels
-# of each level of its pyramid: beyond a scale of two (five levels) they would be too coarse for relative geometry. By
-# Harris' measure, which grows with the fourth power of contrast, they would crowd on one printed board; by FAST's, not.
+# Thresholds are low: the strongest points are taken even with weak texture. ORB locates points at whole pixels of each
+# level of its pyramid: beyond a scale of two (five levels) they are too coarse for relative geometry. The Harris score
+# grows with the fourth power of contrast and would cluster the points; the FAST score does not.
 KINDS: dict[str, Kind] = {
     "orb": Kind(lambda cv2, n: cv2.ORB_create(2 * n, fastThreshold=10, nlevels=5, scoreType=cv2.ORB_FAST_SCORE)),
     "sift": Kind(lambda cv2, n: cv2.SIFT_create(nfeatures=n, contrastThreshold=0.02), at_once=True),
@@ -64,14 +69,14 @@ class Features:
 
     xy_px: Floats
     xy_n: Floats
-    descriptors: NDArray[Any]
+    descriptors: NDArray[np.generic]
 
     def __len__(self) -> int:
         return len(self.xy_px)
 
 
 def require(name: str) -> Kind:
-    """The kind of this name, which the installed OpenCV can make.
+    """The kind of this name, checked against the installed OpenCV.
 
     Raises
     ------
@@ -95,7 +100,7 @@ def require(name: str) -> Kind:
 
 
 def available() -> list[str]:
-    """Names that the installed OpenCV can make."""
+    """Names that the installed OpenCV supports."""
     found = []
     for name in KINDS:
         try:
@@ -106,8 +111,8 @@ def available() -> list[str]:
     return found
 
 
-def make(name: str, count: int) -> tuple[Any, Any]:
-    """Detector and descriptor of OpenCV; AttributeError where its build lacks one."""
+def make(name: str, count: int) -> tuple[cv2.Feature2D, cv2.Feature2D]:
+    """Detector and descriptor of OpenCV; AttributeError if its build has no such one."""
     import cv2
 
     kind = KINDS[name]
@@ -116,7 +121,7 @@ def make(name: str, count: int) -> tuple[Any, Any]:
 
 
 def extract(gray: Gray, camera: Camera, name: str, count: int) -> Features:
-    """At most `count` points of a picture, spread over it, with their descriptors.
+    """At most `count` points that cover a picture, with their descriptors.
 
     Parameters
     ----------
@@ -133,22 +138,25 @@ def extract(gray: Gray, camera: Camera, name: str, count: int) -> Features:
     return Features(xy_px[good], xy_n[good], descriptors[good])
 
 
-def _described(gray: Gray, name: str, count: int) -> tuple[list[Any], Any]:
+def _described(gray: Gray, name: str, count: int) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.generic]]:
     """Points of OpenCV with their descriptors."""
     detector, descriptor = make(name, count)
-    described: Any = None
+    described: NDArray[np.generic] = np.zeros((0, 1), dtype=np.uint8)
     if KINDS[name].at_once:
         points, described = detector.detectAndCompute(gray, None)
     else:
         points = detector.detect(gray)
     if not points:
-        return [], None
+        return [], described
     best = spread(*_places(points), gray.shape, count)
-    chosen = [points[i] for i in best]
-    return (chosen, described[best]) if described is not None else descriptor.compute(gray, chosen)
+    strongest = [points[i] for i in best]
+    if KINDS[name].at_once:
+        return strongest, described[best]
+    points, described = descriptor.compute(gray, strongest)
+    return points, np.asarray(described)
 
 
-def _places(points: Sequence[Any]) -> tuple[Floats, Floats]:
+def _places(points: Sequence[cv2.KeyPoint]) -> tuple[Floats, Floats]:
     """Pixels (n, 2) and strengths (n,); detectors without a response are ranked by size."""
     xy = np.array([point.pt for point in points], dtype=np.float64)
     strength = np.array([point.response for point in points], dtype=np.float64)

@@ -1,11 +1,11 @@
-"""Which matches of a pair are to be believed, where the turn between the images is known: all pairs at once.
+"""Outliers among the matches of image pairs whose rotation is known: all pairs at once.
 
-With R known, each match gives the normal n = R x1~ x x0~ of its epipolar plane, and the baseline is at right angles to
-all of them: two matches give a hypothesis, and the one that most matches agree with is taken (MSAC). It is compared
-with the turn that was told, not with a fit of its own: a pair in which all points jump alike fits its own wrong motion.
+With R known, each match gives the normal n = R x1~ x x0~ of its epipolar plane, and the baseline is normal to all of
+them: two matches give a hypothesis, and that with which most matches agree is taken (MSAC). The given rotation is
+used, not one fitted to the matches: if all points of a pair shift alike, a fit would follow the wrong motion.
 
-A wrong match that happens to lie on its epipolar line does most harm where it seems to be near: its weight grows with
-the square of its parallax. So a point must lie in front of both cameras, and not much nearer than the others.
+A wrong match on its epipolar line has the more influence the nearer its point seems: its weight grows with the square
+of its parallax. So a point must lie in front of both cameras, and not much nearer than the others.
 
 Source: Torr, Zisserman (2000), MLESAC, CVIU 78(1); Kneip, Chli, Siegwart (2011), Robust real-time visual odometry with
 a single camera and an IMU, BMVC.
@@ -23,19 +23,19 @@ from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.vision.epipolar import cross, rays
 from smartnav_graph.vision.pairs import Pairs
 
-# Residual in sigmas up to which a match agrees, and hypotheses tried: with 30 % outliers half of them are sound.
-AGREES = 3.0
-# A point nearer than so many times this quantile of the inliers' inverse distances is not believed.
+# Largest residual of an inlier in sigmas. With 30 % outliers half of the hypotheses are free of them.
+INLIER_SIGMAS = 3.0
+# Largest inverse distance of a point, in units of this quantile of the inliers' inverse distances.
 MUCH_NEARER, NEAR_SHARE = 3.0, 0.75
-TRIED = 40
-# Matches times hypotheses looked at in one go: what stays in the cache.
-AT_ONCE = 20_000
+HYPOTHESES = 40
+# Matches times hypotheses computed in one batch, to fit the cache.
+BATCH = 20_000
 
 
 @dataclass(frozen=True)
 class Gated:
-    """inliers (n, k) of the padded matches; direction (n, 3) of c0_t_c1; parallax (n,) rad, median
-    after the turn is taken out"""
+    """inliers (n, k) of the padded matches; direction (n, 3) of c0_t_c1; parallax (n,) rad, median after the rotation
+    is removed"""
 
     inliers: Mask
     direction: Floats
@@ -43,42 +43,42 @@ class Gated:
 
 
 def gate(pairs: Pairs, R: Floats, sigma: Floats, seed: int = 0) -> Gated:
-    """Matches that agree with the turn told and one baseline.
+    """Matches that agree with the given rotation and one baseline.
 
     Parameters
     ----------
-    R : (n, 3, 3) c0_R_c1 of each pair; sigma : (n,) of a good match in normalised coordinates, the turn's own
-    uncertainty included
+    R : (n, 3, 3) c0_R_c1 of each pair; sigma : (n,) of a good match in normalised coordinates, the
+    uncertainty of the rotation included
     """
     geometry = Geometry.of(pairs, R)
-    limit = (AGREES * sigma[:, None]) ** 2
+    limit = (INLIER_SIGMAS * sigma[:, None]) ** 2
     rng = np.random.default_rng(seed)
     best, cost = np.tile([0.0, 0.0, 1.0], (len(R), 1)), np.full(len(R), np.inf)
     count = np.maximum(pairs.count, 1)
-    at_once = int(np.clip(AT_ONCE // max(pairs.there.size, 1), 1, TRIED))
-    for _ in range(-(-TRIED // at_once)):
+    at_once = int(np.clip(BATCH // max(pairs.there.size, 1), 1, HYPOTHESES))
+    for _ in range(-(-HYPOTHESES // at_once)):
         drawn = (rng.random((2, at_once, len(R))) * count).astype(np.intp)
         best, cost = _better(geometry, cross(*(geometry.normals_at(place) for place in drawn)), limit, best, cost)
     for _ in range(2):
         weight = (geometry.square(best) < limit) & pairs.there
         best, cost = _better(geometry, geometry.fitted(weight / geometry.scale(best))[None], limit, best, cost)
     inliers = (geometry.square(best) < limit) & pairs.there
-    best = best * np.where(_median(geometry.nearness(best)[0], inliers) < 0.0, -1.0, 1.0)[:, None]
+    best = best * np.where(_median(geometry.inverse_distance(best)[0], inliers) < 0.0, -1.0, 1.0)[:, None]
     return Gated(inliers & geometry.plausible(best, sigma, inliers), best, geometry.parallax())
 
 
-def _better(geometry: Geometry, tried: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
+def _better(geometry: Geometry, hypotheses: Floats, limit: Floats, best: Floats, cost: Floats) -> tuple[Floats, Floats]:
     """The best of some baselines (h, n, 3) of each pair and the one before (n, 3), and its cost (n,)."""
-    size = np.linalg.norm(tried, axis=-1, keepdims=True)
-    tried = np.where(size > 1e-12, tried / np.maximum(size, 1e-12), best)
-    new = np.where(geometry.there, np.minimum(geometry.square(tried), limit), 0.0).sum(axis=-1)
+    size = np.linalg.norm(hypotheses, axis=-1, keepdims=True)
+    hypotheses = np.where(size > 1e-12, hypotheses / np.maximum(size, 1e-12), best)
+    new = np.where(geometry.there, np.minimum(geometry.square(hypotheses), limit), 0.0).sum(axis=-1)
     first, row = new.argmin(axis=0), np.arange(len(best))
     take = new[first, row] < cost
-    return np.where(take[:, None], tried[first, row], best), np.where(take, new[first, row], cost)
+    return np.where(take[:, None], hypotheses[first, row], best), np.where(take, new[first, row], cost)
 
 
 class Geometry:
-    """Pairs whose turn R (n, 3, 3) is known: rays a, y (n, k, 3) of both images in the axes of the first one."""
+    """Pairs whose rotation R (n, 3, 3) is known: rays a, y (n, k, 3) of both images in the axes of the first one."""
 
     def __init__(self, a: Floats, y: Floats, R: Floats, there: Mask) -> None:
         self.a, self.y, self.R, self.there = a, y, R, there
@@ -111,11 +111,11 @@ class Geometry:
         return np.asarray(e**2 / self.scale(t))
 
     def fitted(self, weight: Floats) -> Floats:
-        """Baselines (n, 3) that weighted matches (n, k) agree with best."""
+        """Baselines (n, 3) of least squares of weighted matches (n, k)."""
         moment = (self.normals * weight[..., None]).transpose(0, 2, 1) @ self.normals
         return np.asarray(np.linalg.eigh(moment)[1][:, :, 0])
 
-    def nearness(self, t: Floats) -> tuple[Floats, Floats]:
+    def inverse_distance(self, t: Floats) -> tuple[Floats, Floats]:
         """Inverse distance (n, k) along the rays of the first image, in units of the baselines t (n, 3), and its sigma
         for one of the points."""
         across = cross(t[:, None], self.y)
@@ -127,8 +127,8 @@ class Geometry:
 
         t : (n, 3) baselines with their sign; sigma : (n,) of a match
         """
-        near, spread = self.nearness(t)
-        doubt = AGREES * sigma[:, None] * spread
+        near, spread = self.inverse_distance(t)
+        doubt = INLIER_SIGMAS * sigma[:, None] * spread
         ahead = near > -doubt
         usual = _median(near, inliers & ahead, NEAR_SHARE)[:, None]
         return np.asarray(ahead & (near < MUCH_NEARER * np.maximum(usual, 0.0) + doubt))

@@ -20,6 +20,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
+from smartnav_graph.vision.pairs import rows_at_rate
 
 Gray = NDArray[np.uint8]
 
@@ -38,8 +39,6 @@ LEAST_CONTRAST = 16.0
 LEAST_SHARPNESS = 0.5
 USUAL_OF, USUAL_FROM = 200, 5  # pictures
 _SMALL_PX = 400
-# Pictures closer than this share of the spacing asked for count as far enough apart: stamps jitter.
-NEARLY = 0.95
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,12 @@ def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
     """At most `rate_hz` pictures a second of each camera; all where the rate is 0."""
     if rate_hz <= 0:
         return found
-    least, last, kept = NEARLY * NS / rate_hz, dict[str, int](), list[Picture]()
-    for picture in found:
-        if picture.t_ns - last.get(picture.camera, -(2**62)) >= least:
-            last[picture.camera] = picture.t_ns
-            kept.append(picture)
-    return kept
+    by_camera: dict[str, list[int]] = {}
+    for row, picture in enumerate(found):
+        by_camera.setdefault(picture.camera, []).append(row)
+    stamps = np.array([picture.t_ns for picture in found], dtype=np.int64)
+    rows = sorted(rows[i] for rows in by_camera.values() for i in rows_at_rate(stamps[rows], rate_hz))
+    return [found[row] for row in rows]
 
 
 def look(picture: Picture, camera: Camera | None) -> Look:

@@ -1,4 +1,4 @@
-"""Matched points of many image pairs side by side, padded to one length so that all pairs are treated at once."""
+"""Matched points of many image pairs, padded to one length so that all pairs are computed at once."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Matches, Tracks
 
 Ints = NDArray[np.intp]
 
-# Images closer than this share of the spacing asked for count as far enough apart: stamps jitter.
+# Smallest spacing of images over that of the rate: stamps jitter.
 NEARLY = 0.95
 
 
@@ -23,10 +23,10 @@ NEARLY = 0.95
 class Pairs:
     """Pairs of images of one camera.
 
-    t_ns (k,) : stamps of the images, in time order; images (n, 2) : places of the first and second image of each pair
+    t_ns (k,) : stamps of the images, in time order; images (n, 2) : index of the first and second image of each pair
     x0, x1 (m, 2) : undistorted normalised coordinates; pair (m,) : of each match, ascending
-    shift (m, 3) : what the baseline of each match has beyond that of its pair, m in the axes of the first camera: their
-    rows were not seen at the time of the image
+    shift (m, 3) : baseline of each match less that of its pair, m in the axes of the first camera (rolling shutter: its
+    rows were not exposed at the time of the image)
     """
 
     t_ns: NDArray[np.int64]
@@ -51,14 +51,14 @@ class Pairs:
 
     @cached_property
     def slots(self) -> Ints:
-        """Match (n, k) behind each place of the padded arrays, -1 behind empty ones."""
+        """Index (n, k) of the match of each entry of the padded arrays, -1 of empty ones."""
         first = np.concatenate([[0], np.cumsum(self.count)])[:-1]
         place = np.arange(max(int(self.count.max(initial=0)), 1))
         return np.where(place < self.count[:, None], first[:, None] + place, -1)
 
     @cached_property
     def there(self) -> NDArray[np.bool_]:
-        """Mask (n, k) of the places that hold a match."""
+        """Mask (n, k) of the entries that hold a match."""
         return self.slots >= 0
 
     @cached_property
@@ -69,13 +69,13 @@ class Pairs:
 
     def of(self, rows: Ints) -> Pairs:
         """Some of the pairs, in ascending order."""
-        chosen = np.isin(self.pair, rows)
-        pair = np.searchsorted(rows, self.pair[chosen])
-        shift = None if self.shift is None else self.shift[chosen]
-        return Pairs(self.t_ns, self.images[rows], self.x0[chosen], self.x1[chosen], pair, shift)
+        mine = np.isin(self.pair, rows)
+        pair = np.searchsorted(rows, self.pair[mine])
+        shift = None if self.shift is None else self.shift[mine]
+        return Pairs(self.t_ns, self.images[rows], self.x0[mine], self.x1[mine], pair, shift)
 
     def padded(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
-        """One value or row a match (m, ...) as (n, k, ...); zero in empty places."""
+        """One value or row a match (m, ...) as (n, k, ...); zero in empty entries."""
         if not len(values):
             return np.zeros((*self.slots.shape, *values.shape[1:]), dtype=values.dtype)
         return np.where(self.there.reshape(*self.there.shape, *[1] * (values.ndim - 1)), values[self.slots], 0)
@@ -85,28 +85,29 @@ class Pairs:
         return values[self.there]
 
 
-def of_matches(matches: Matches) -> Pairs:
+def pairs_of_matches(matches: Matches) -> Pairs:
     """Pairs as they were matched; the later image is the second."""
-    turned = matches.t_1_ns < matches.t_ns
-    early, late = np.where(turned, matches.t_1_ns, matches.t_ns), np.where(turned, matches.t_ns, matches.t_1_ns)
-    x0 = np.where(turned[:, None], matches.xy1_n, matches.xy0_n)
-    x1 = np.where(turned[:, None], matches.xy0_n, matches.xy1_n)
-    moved = early != late
-    stamps = np.unique(np.concatenate([early[moved], late[moved]]))
-    both = np.stack([np.searchsorted(stamps, early[moved]), np.searchsorted(stamps, late[moved])], axis=1)
+    swap = matches.t_1_ns < matches.t_ns
+    early, late = np.minimum(matches.t_ns, matches.t_1_ns), np.maximum(matches.t_ns, matches.t_1_ns)
+    x0 = np.where(swap[:, None], matches.xy1_n, matches.xy0_n)
+    x1 = np.where(swap[:, None], matches.xy0_n, matches.xy1_n)
+    apart = early != late
+    stamps = np.unique(np.concatenate([early[apart], late[apart]]))
+    both = np.stack([np.searchsorted(stamps, early[apart]), np.searchsorted(stamps, late[apart])], axis=1)
     images, pair = np.unique(both[:, ::-1], axis=0, return_inverse=True)  # by the second image: the order of a replay
     order = np.argsort(pair.ravel(), kind="stable")
-    rows = np.flatnonzero(moved)[order]
+    rows = np.flatnonzero(apart)[order]
     return Pairs(stamps, images[:, ::-1].astype(np.intp), x0[rows], x1[rows], pair.ravel()[order].astype(np.intp))
 
 
-def of_tracks(tracks: Tracks, rate_hz: float, spans: Sequence[int]) -> Pairs:
-    """What images `spans` apart have in common, of images at most `rate_hz` a second."""
-    stamps = _thinned(np.unique(tracks.t_ns), rate_hz)
-    chosen = np.flatnonzero(np.isin(tracks.t_ns, stamps))
-    image = np.searchsorted(stamps, tracks.t_ns[chosen])
-    order = np.lexsort((tracks.track_id[chosen], image))
-    image, track, xy = image[order], tracks.track_id[chosen][order], tracks.xy_n[chosen][order]
+def pairs_of_tracks(tracks: Tracks, rate_hz: float, spans: Sequence[int]) -> Pairs:
+    """Common tracks of images that are `spans` apart, of images at most `rate_hz` a second."""
+    stamps = np.unique(tracks.t_ns)
+    stamps = stamps[rows_at_rate(stamps, rate_hz)]
+    seen = np.flatnonzero(np.isin(tracks.t_ns, stamps))
+    image = np.searchsorted(stamps, tracks.t_ns[seen])
+    order = np.lexsort((tracks.track_id[seen], image))
+    image, track, xy = image[order], tracks.track_id[seen][order], tracks.xy_n[seen][order]
     edges = np.searchsorted(image, np.arange(len(stamps) + 1))
     images: list[tuple[int, int]] = []
     rows: list[tuple[Ints, Ints]] = []
@@ -126,10 +127,11 @@ def of_tracks(tracks: Tracks, rate_hz: float, spans: Sequence[int]) -> Pairs:
     return Pairs(stamps, np.array(images, dtype=np.intp), xy[left], xy[right], pair)
 
 
-def _thinned(stamps: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Stamps at most `rate_hz` a second."""
-    least, kept = NEARLY * NS / rate_hz, list[int]()
-    for stamp in stamps.tolist():
-        if not kept or stamp - kept[-1] >= least:
-            kept.append(stamp)
-    return np.array(kept, dtype=np.int64)
+def rows_at_rate(t_ns: Times, rate_hz: float) -> Ints:
+    """Rows of ascending stamps (n,) such that there are at most `rate_hz` a second."""
+    least, rows, last = NEARLY * NS / rate_hz, list[int](), -(2**62)
+    for row, stamp in enumerate(t_ns.tolist()):
+        if stamp - last >= least:
+            rows.append(row)
+            last = stamp
+    return np.array(rows, dtype=np.intp)

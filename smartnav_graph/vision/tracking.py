@@ -1,9 +1,9 @@
-"""Corners followed from picture to picture, the search begun where the gyroscope says they have gone.
+"""Corners tracked from picture to picture, with the gyroscope as prediction.
 
     x1~ ~ c1_R_c0 x0~,   c1_R_c0 = (body_R_cam)^T (b0_R_b1)^T body_R_cam,   b0_R_b1 the integrated body rate
 
-(through the camera's distortion; without it that is the homography K R K^-1). A corner is lost when the way back, begun
-where the same rotation says, does not lead to where it came from. New corners are taken where there are none.
+(through the camera's distortion; without it that is the homography K R K^-1). A corner is dropped if tracking back,
+with the inverse rotation as prediction, does not return to it. New corners are detected away from the others.
 
 Source: Lucas, Kanade (1981); Bouguet (2000), Pyramidal implementation of the Lucas Kanade feature tracker; Shi, Tomasi
 (1994), Good features to track; Hwangbo, Kim, Kanade (2009), Inertial-aided KLT feature tracking, IROS.
@@ -27,10 +27,10 @@ from smartnav_graph.vision.images import Gray
 
 WINDOW_PX = 21
 LEVELS = 3
-# Largest distance between a corner and where the way there and back leads, px.
+# Largest distance between a corner and its position after tracking forth and back, px.
 RETURN_PX = 0.5
 QUALITY = 0.01
-# Least distance between corners over that of a square grid of as many.
+# Least distance between corners over that of a square grid of the same number.
 SPACING = 0.6
 
 
@@ -71,7 +71,7 @@ class Gyro:
 class Tracker:
     """Corners of one camera.
 
-    camera, body_R_cam (3, 3); gyro : None searches where the corners were; count : corners wanted; ids : gives names
+    camera, body_R_cam (3, 3); gyro : None: no prediction; count : number of corners; ids : gives the track ids
     """
 
     camera: Camera
@@ -87,11 +87,11 @@ class Tracker:
     _id: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def step(self, gray: Gray, t_ns: int) -> tuple[NDArray[np.int64], Floats]:
-        """Names (n,) and pixels (n, 2) of the corners in the next picture, taken at `t_ns` of the camera's clock."""
+        """Track ids (n,) and pixels (n, 2) of the corners in the next picture, taken at `t_ns` (camera clock)."""
         if self._gray is not None and len(self._px):
             turn = self._turn(t_ns)
-            found, kept = follow(self._gray, gray, self._px, self.camera, turn)
-            self._px, self._id = found[kept], self._id[kept]
+            found, good = follow(self._gray, gray, self._px, self.camera, turn)
+            self._px, self._id = found[good], self._id[good]
         self._gray, self._t_ns = gray, t_ns
         fresh = self._corners(gray)
         self._px = np.concatenate([self._px, fresh])
@@ -99,7 +99,7 @@ class Tracker:
         return self._id, self._px
 
     def _turn(self, t_ns: int) -> Floats | None:
-        """c1_R_c0 from the last picture to this one, counted where the gyroscope does not tell it."""
+        """c1_R_c0 from the last picture to this one; counts pictures without gyroscope data."""
         offset = round(self.camera.time_offset_s * NS)
         turn = None if self.gyro is None else self.gyro.turn(self._t_ns + offset, t_ns + offset)
         self.predicted += turn is not None
@@ -107,7 +107,7 @@ class Tracker:
         return None if turn is None else self.body_R_cam.T @ turn.T @ self.body_R_cam
 
     def _corners(self, gray: Gray) -> Floats:
-        """New corners, away from those that there are."""
+        """New corners, away from the present ones."""
         import cv2
 
         wanted = self.count - len(self._px)
@@ -122,11 +122,11 @@ class Tracker:
 
 
 def rotated(px: Floats, camera: Camera, c1_R_c0: Floats | None) -> Floats:
-    """Where pixels (n, 2) of points at infinity go when the camera turns; where they are, if the turn is unknown."""
+    """Pixels (n, 2) of points at infinity after a rotation of the camera; unchanged if the rotation is unknown."""
     if c1_R_c0 is None or not len(px):
         return px
     x, y, z = c1_R_c0 @ rays(camera.normalised(px)).T
-    ahead = z > 0.1  # beside or behind the camera there is no pixel to look at
+    ahead = z > 0.1  # no pixel beside or behind the camera
     z = np.where(ahead, z, 1.0)
     return np.where(ahead[:, None], camera.pixels(np.stack([x / z, y / z], axis=1)), px)
 

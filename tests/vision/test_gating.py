@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.vision.gating import AGREES, gate
+from smartnav_graph.vision.gating import INLIER_SIGMAS, gate
 from smartnav_graph.vision.pairs import Pairs
 
 SIGMA = 1.2e-3
@@ -58,4 +58,4 @@ def test_the_same_seed_gives_the_same_verdict(rng):
     pairs, R, _, _ = simulated(rng)
     one, other = (gate(pairs, R, np.full(len(pairs), SIGMA), seed=4).inliers for _ in range(2))
     np.testing.assert_array_equal(one, other)
-    assert AGREES > 2.0
+    assert INLIER_SIGMAS > 2.0

@@ -5,7 +5,7 @@ import pytest
 
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Matches, Tracks
-from smartnav_graph.vision.pairs import of_matches, of_tracks
+from smartnav_graph.vision.pairs import pairs_of_matches, pairs_of_tracks
 
 
 def tracks():
@@ -17,7 +17,7 @@ def tracks():
 
 
 def test_tracks_are_paired_at_their_spans():
-    pairs = of_tracks(tracks(), 10.0, (1, 3))
+    pairs = pairs_of_tracks(tracks(), 10.0, (1, 3))
     assert [tuple(p) for p in pairs.images] == [(0, 1), (1, 2), (2, 3), (0, 3), (3, 4), (1, 4)]
     assert pairs.count.tolist() == [3, 3, 2, 2, 2, 2]
     np.testing.assert_array_equal((pairs.x1 - pairs.x0)[:, 0], np.repeat([1, 1, 1, 3, 1, 3], pairs.count))
@@ -25,12 +25,12 @@ def test_tracks_are_paired_at_their_spans():
 
 
 def test_images_are_no_closer_than_the_rate():
-    assert of_tracks(tracks(), 5.0, (1,)).t_ns.tolist() == [0, 2 * NS // 10, 4 * NS // 10]
-    assert len(of_tracks(tracks(), 1.0, (1,))) == 0
+    assert pairs_of_tracks(tracks(), 5.0, (1,)).t_ns.tolist() == [0, 2 * NS // 10, 4 * NS // 10]
+    assert len(pairs_of_tracks(tracks(), 1.0, (1,))) == 0
 
 
 def test_padding_and_back():
-    pairs = of_tracks(tracks(), 10.0, (1, 3))
+    pairs = pairs_of_tracks(tracks(), 10.0, (1, 3))
     padded = pairs.padded(pairs.x0)
     assert padded.shape == (6, 3, 2) and pairs.there.sum() == len(pairs.x0)
     np.testing.assert_array_equal(pairs.flat(padded), pairs.x0)
@@ -50,18 +50,18 @@ def matches(t_ns, t_1_ns):
 
 
 def test_the_later_image_comes_second():
-    pairs = of_matches(matches([0, 0, 30, 30], [20, 30, 20, 20]))
+    pairs = pairs_of_matches(matches([0, 0, 30, 30], [20, 30, 20, 20]))
     assert pairs.t_ns.tolist() == [0, 20, 30]
     assert [tuple(p) for p in pairs.images] == [(0, 1), (0, 2), (1, 2)]
     assert pairs.x0[:2, 0].tolist() == [0.0, 2.0] and pairs.x0[2:, 0].tolist() == [104.0, 106.0]
 
 
 def test_an_image_matched_with_itself_is_no_pair():
-    assert len(of_matches(matches([5, 5], [5, 5]))) == 0
+    assert len(pairs_of_matches(matches([5, 5], [5, 5]))) == 0
 
 
 @pytest.mark.parametrize("spans", [(1,), (7,)])
 def test_tracks_without_common_points_make_no_pairs(spans):
     lone = Tracks(t_ns=np.arange(3) * NS, image_id=np.arange(3), track_id=np.arange(3), xy_n=np.zeros((3, 2)))
-    pairs = of_tracks(lone, 10.0, spans)
+    pairs = pairs_of_tracks(lone, 10.0, spans)
     assert len(pairs) == 0 and pairs.padded(pairs.x0).shape[0] == 0

@@ -4,8 +4,8 @@ import numpy as np
 
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Tracks
-from smartnav_graph.vision.pairs import of_tracks
-from smartnav_graph.vision.zero_motion import STILL, still_periods
+from smartnav_graph.vision.pairs import pairs_of_tracks
+from smartnav_graph.vision.zero_motion import MOST_DISPLACEMENT, static_periods
 
 RATE = 10
 
@@ -23,7 +23,7 @@ def seen(speed, seconds=12.0, count=20, noise=3e-4):
 
 
 def periods(tracks):
-    found = still_periods(of_tracks(tracks, 4.0, (1, 2, 4)))
+    found = static_periods(pairs_of_tracks(tracks, 4.0, (1, 2, 4)))
     return [] if found is None else [(a / NS, b / NS) for a, b in zip(found.t_ns, found.t_end_ns, strict=True)]
 
 
@@ -34,7 +34,7 @@ def test_two_stops_are_two_periods():
 
 
 def test_a_moving_camera_never_stands():
-    assert periods(seen(lambda s: 4 * STILL)) == []
+    assert periods(seen(lambda s: 4 * MOST_DISPLACEMENT)) == []
 
 
 def test_points_too_few_to_tell_say_nothing():

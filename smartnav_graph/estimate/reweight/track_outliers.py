@@ -22,7 +22,7 @@ from smartnav_graph.factors.smart import CONTRARY, FEW, FLAT, IN_USE, LEAST_SEEN
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.vision.points import Cameras, Points, meet
+from smartnav_graph.vision.points import Cameras, TrackPoints, triangulate
 
 # Passes that judge tracks.
 ROUNDS = 2
@@ -55,7 +55,7 @@ def _judged(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) ->
         builder.boresight = estimate.session_value(BORESIGHT, 3)
     views = _views(builder, estimate)
     use = seen.there & views.known
-    points = meet(seen, views.then, builder.sigma * pass_state.scale(builder.name), use)
+    points = triangulate(seen, views.then, builder.sigma * pass_state.scale(builder.name), use)
     builder.use, builder.verdict = points.inside, _verdict(builder, use, points)
     builder.xy = seen.xy + views.keyframe.project(points.point) - views.then.project(points.point)
     builder.refused = _refusal(builder.verdict)
@@ -107,7 +107,7 @@ def _camera(builder: SmartBuilder, R: Floats, p: Floats) -> Cameras:
     return Cameras((R @ builder.body_R_cam).reshape(*shape, 3, 3), place.reshape(*shape, 3))
 
 
-def _verdict(builder: SmartBuilder, use: Mask, points: Points) -> NDArray[np.intp]:
+def _verdict(builder: SmartBuilder, use: Mask, points: TrackPoints) -> NDArray[np.intp]:
     """What becomes of each track (n,), of its observations in the stretch (n, l)."""
     asked, kept = use.sum(axis=1), points.inside.sum(axis=1)
     cases = {
@@ -130,7 +130,7 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
     )
 
 
-def _scale(builder: SmartBuilder, points: Points) -> float:
+def _scale(builder: SmartBuilder, points: TrackPoints) -> float:
     """Scale of the sigma of an observation: the root mean square of those in use, what the points take put back."""
     tracks = builder.verdict == IN_USE
     square = (points.residual[points.inside & tracks[:, None]] ** 2).sum() / builder.sigma**2
@@ -148,7 +148,7 @@ def whitened(
         return None
     seen = builder.sightings
     sigma = builder.sigma * pass_state.scale(builder.name)
-    points = meet(seen, _views(builder, estimate).then, sigma, builder.use)
+    points = triangulate(seen, _views(builder, estimate).then, sigma, builder.use)
     told = seen.there & (builder.verdict == IN_USE)[:, None]
     return builder.image_ns[seen.image[told]], points.residual[told] / sigma, builder.use[told]
 

@@ -12,7 +12,7 @@ from smartnav_graph.output.rerun_log.cameras import CameraView
 from smartnav_graph.output.rerun_log.events import stops
 from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.session.session import Session
-from smartnav_graph.vision.pairs import of_matches
+from smartnav_graph.vision.pairs import pairs_of_matches
 
 # A pair for show: matched, not yet judged.
 UNJUDGED = len(REASONS)
@@ -22,7 +22,7 @@ def image_pairs(session: Session, trace_pairs: ImagePairs | None) -> ImagePairs 
     """The pairs of a run; of a session alone those that were matched, not judged."""
     if trace_pairs is not None or session.matches is None:
         return trace_pairs
-    pairs = of_matches(session.matches)
+    pairs = pairs_of_matches(session.matches)
     everything = np.ones(len(pairs.pair), dtype=bool)
     return ImagePairs(pairs, everything, np.full(len(pairs), UNJUDGED, dtype=np.intp))
 
