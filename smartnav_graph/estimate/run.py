@@ -19,7 +19,7 @@ from smartnav_graph.estimate.problem import Problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     Withheld,
     resample,
-    score,
+    score_holdout,
     to_solution,
     used_counts,
 )
@@ -108,7 +108,7 @@ def _finish(
 ) -> Run:
     problem, estimate = solved.problem, solved.estimate
     keyframes = to_solution(solved)
-    withheld = score(problem, keyframes, estimate)
+    withheld = score_holdout(problem, keyframes, estimate)
     solution = resample(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)

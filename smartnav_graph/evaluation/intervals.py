@@ -27,7 +27,7 @@ from smartnav_graph.core.so3 import exp, from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.replay import replay
-from smartnav_graph.estimate.result.assemble import kinematics, placed, predict_sensor
+from smartnav_graph.estimate.result.assemble import kinematics, predict_sensor, sensor_positions
 from smartnav_graph.estimate.run import Run
 from smartnav_graph.evaluation.metrics import Statistics
 from smartnav_graph.graph.interpolate import predicted_at
@@ -237,4 +237,4 @@ class ReferencePoint:
         bridged with the velocity."""
         assert run.causal is not None  # of a replay
         there = predicted_at(run.causal_windows, kinematics(run.causal), run.session.gravity, t_ns)
-        return placed(there, np.full(len(t_ns), self.offset_s), np.array(self.lever))
+        return sensor_positions(there, np.full(len(t_ns), self.offset_s), np.array(self.lever))

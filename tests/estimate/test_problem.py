@@ -11,6 +11,7 @@ from sessions import on_control, recorded, shifted, with_gnss
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.preparation import PREPARE, Notes
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.session.streams import Temperature
 from smartnav_graph.simulation.degrade import Degrade, degrade
@@ -133,3 +134,15 @@ def test_pictures_that_nobody_matched_are_told():
     assert "images: 3 pictures are not matched yet, and not used; run `smartnav match` first" in warnings
     nameless = replace(images, file=np.full(3, "", dtype=object))
     assert not any("not matched" in text for text in prepare(session.replace(images=nameless), Config()).warnings)
+
+
+def test_each_step_of_the_preparation_stands_alone(eight):
+    notes = Notes(Config(run=RunConfig(start_s=5.0, end_s=20.0)))
+    session = PREPARE["span"](eight, notes)
+    assert session is eight and np.diff(notes.span) == 15 * NS
+    session = PREPARE["outside"](session, notes)
+    assert (session.gnss.t_ns >= notes.span[0]).all() and (session.gnss.t_ns <= notes.span[1]).all()
+    assert not notes.dropped  # rows outside --from and --to are no loss
+    notes.drop("older", {"gnss": 2})
+    notes.drop("later", {"gnss": 1})
+    assert notes.dropped == {"gnss": {"older": 2, "later": 1}}

@@ -180,9 +180,9 @@ def kinematics(solution: Solution) -> Kinematics:
     return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
 
 
-def score(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str, Withheld]:
+def score_holdout(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str, Withheld]:
     """Withheld rows against the smoothed prediction through their sensor's model: at its time offset, with its lever
-    arm. A sensor with offset tau speaks of IMU time t + tau; beyond the ends the velocity carries on."""
+    arm. Stamps t of a sensor with offset tau are IMU time t + tau; beyond the ends the velocity is constant."""
     scored = {}
     for name, stream in problem.withheld.items():
         inside = (stream.t_ns >= keyframes.t_ns[0]) & (stream.t_ns <= keyframes.t_ns[-1])
@@ -203,10 +203,10 @@ def predict_sensor(
     shifted = t_ns + round(offset_s * NS)
     known = np.clip(shifted, solution.t_ns[0], solution.t_ns[-1])
     there = states_at(problem.windows, kinematics(solution), problem.session.gravity, known)
-    return placed(there, (shifted - known) / NS, lever)
+    return sensor_positions(there, (shifted - known) / NS, lever)
 
 
-def placed(there: Kinematics, ahead_s: Floats, lever: Floats) -> Floats:
+def sensor_positions(there: Kinematics, ahead_s: Floats, lever: Floats) -> Floats:
     """Positions (n, 3) of a sensor at lever arms (n, 3) or (3,), `ahead_s` (n,) after states by velocity alone."""
     arms = np.broadcast_to(lever, there.p.shape)
     return np.asarray(there.p + there.v * ahead_s[:, None] + rotate(there.R, arms))

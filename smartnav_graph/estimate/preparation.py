@@ -1,0 +1,212 @@
+"""What is done to a session before the graph is built: named steps, each (session, notes) -> session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.timebase import NS, Gap, find_gaps
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.factors import FACTORS
+from smartnav_graph.factors.coplanarity import pairs_of
+from smartnav_graph.factors.pose_fix import undo_latency
+from smartnav_graph.session import health
+from smartnav_graph.session.calibration.apply import corrected
+from smartnav_graph.session.calibration.model import Calibration, ImuErrors
+from smartnav_graph.session.detect.standstills import Standstills, find_standstills
+from smartnav_graph.session.holdout import split
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.stream import Positioned, Stream
+from smartnav_graph.vision.pairs import Pairs
+from smartnav_graph.vision.zero_motion import static_periods
+
+
+@dataclass
+class Notes:
+    """What the steps find out beside the session.
+
+    span : first and last stamp to smooth; gaps : of the inertial data inside it
+    withheld : rows held out, by stream; dropped : rows that are not used, by stream and reason
+    """
+
+    config: Config
+    span: tuple[int, int] = (0, 0)
+    gaps: Sequence[Gap] = ()
+    calibration: Calibration = field(default_factory=Calibration)
+    withheld: Mapping[str, Positioned] = field(default_factory=dict)
+    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    pairs: Pairs | None = None
+    rests: Standstills | None = None
+
+    def drop(self, reason: str, counts: Mapping[str, int]) -> None:
+        """Count rows that are not used, by stream."""
+        for name, count in counts.items():
+            self.dropped.setdefault(name, {})[reason] = count
+
+
+Step = Callable[[Session, Notes], Session]
+
+
+def choose_span(session: Session, notes: Notes) -> Session:
+    """The stretch asked for, inside the inertial data."""
+    imu, run = session.require_imu(), notes.config.run
+    t0, last = session.t0_ns, int(imu.t_ns[-1])
+    start = t0 if run.start_s is None else t0 + round(run.start_s * NS)
+    end = last if run.end_s is None else t0 + round(run.end_s * NS)
+    notes.span = max(start, t0), min(end, last)
+    if notes.span[0] >= notes.span[1]:
+        raise ConfigError(
+            "--from, --to",
+            f"nothing between {run.start_s} and {run.end_s} s",
+            f"a stretch inside 0 to {(last - t0) / NS:.2f} s",
+        )
+    return session
+
+
+def find_imu_gaps(session: Session, notes: Notes) -> Session:
+    """Gaps of the inertial data inside the span."""
+    imu, rule = session.require_imu(), notes.config.gaps
+    signal = np.concatenate([imu.gyro, imu.accel], axis=1)
+    gaps = find_gaps(imu.t_ns, signal, missing_s=rule.missing_s, bridged_rows=rule.bridged_rows)
+    notes.gaps = _inside(gaps, notes.span)
+    return session
+
+
+def check_health(session: Session, notes: Notes) -> Session:
+    """Errors of the recording stop, warnings are noted."""
+    checked = health.inspect(session, notes.gaps)
+    checked.raise_errors()
+    notes.warnings += checked.warnings()
+    return session
+
+
+def calibrate(session: Session, notes: Notes) -> Session:
+    """Inertial readings without the errors that the calibration knows, which it then no longer names."""
+    known = session.calibration
+    notes.calibration = known or Calibration()
+    if known is None or known.imu_errors == ImuErrors():
+        return session
+    imu = corrected(session.require_imu(), known.imu_errors)
+    return session.replace(imu=imu, calibration=replace(known, imu_errors=ImuErrors()))
+
+
+def choose_sensors(session: Session, notes: Notes) -> Session:
+    """Only the named sensors, or all but those with a leading minus; the inertial data always stay."""
+    chosen = notes.config.run.sensors
+    if not chosen:
+        return session
+    there = session.streams()
+    names = {name.lstrip("-") for name in chosen}
+    unknown = sorted(names - set(there))
+    if unknown:
+        raise ConfigError("--sensors", f"{', '.join(unknown)} not in this session", f"some of {', '.join(there)}")
+    wanted = {name for name in chosen if not name.startswith("-")}
+    unwanted = {name[1:] for name in chosen if name.startswith("-")}
+    keep = (wanted or set(there)) - unwanted | {"imu", "reference", "images"}
+    return session.replace(**{name: None for name in there if name not in keep})
+
+
+def undo_latencies(session: Session, notes: Notes) -> Session:
+    """Pose fixes at the time they were measured."""
+    return undo_latency(session, notes.config.pose_fixes)
+
+
+def withhold(session: Session, notes: Notes) -> Session:
+    """Rows held out to test the solution with."""
+    session, notes.withheld = split(session, notes.config.run.withhold)
+    return session
+
+
+def drop_outside(session: Session, notes: Notes) -> Session:
+    """Absolute streams inside the span. Rows outside the inertial data are counted, those cut by --from, --to are not."""
+    imu = session.require_imu()
+    changes: dict[str, Stream | None] = {}
+    for name, stream in session.absolute().items():
+        outside = int(((stream.t_ns < imu.t_ns[0]) | (stream.t_ns > imu.t_ns[-1])).sum())
+        if outside:
+            notes.drop("outside the inertial span", {name: outside})
+        inside = (stream.t_ns >= notes.span[0]) & (stream.t_ns <= notes.span[1])
+        changes[name] = stream.take(inside) if inside.any() else None
+        if outside == len(stream):
+            raise SessionError(
+                name,
+                f"all {outside} rows lie outside the inertial span",
+                f"stamps between {imu.t_ns[0]} and {imu.t_ns[-1]} ns",
+                "bring both on one clock",
+                stream=name,
+            )
+    return session.replace(**changes)
+
+
+def trim_span(session: Session, notes: Notes) -> Session:
+    """The span cut to `lead_s` before the first and after the last aiding: dead reckoning beyond is of little use."""
+    aiding, lead_s = session.absolute().values(), notes.config.keyframes.lead_s
+    if not aiding:
+        return session
+    first = min(int(stream.t_ns[0]) for stream in aiding) - round(lead_s * NS)
+    last = max(int(stream.t_ns[-1]) for stream in aiding) + round(lead_s * NS)
+    span = max(notes.span[0], first), min(notes.span[1], last)
+    if span != notes.span:
+        begin, end = ((t_ns - session.t0_ns) / NS for t_ns in span)
+        notes.warnings.append(
+            f"keyframes: smoothed from {begin:.1f} to {end:.1f} s only, {lead_s:g} s around the first and last "
+            "absolute measurement; raise keyframes.lead_s to reckon further"
+        )
+    notes.span, notes.gaps = span, _inside(notes.gaps, span)
+    return session
+
+
+def pair_images(session: Session, notes: Notes) -> Session:
+    """Image pairs, where images are used."""
+    notes.pairs = pairs_of(session, notes.config.image_pairs, smart=notes.config.smart.enabled)
+    return session
+
+
+def detect_standstills(session: Session, notes: Notes) -> Session:
+    """Standstills and stances by inertial data, listed spans and images."""
+    vehicle = notes.config.run.vehicle or session.device.vehicle
+    noise, options = notes.calibration.imu_noise, notes.config.standstill
+    seen = None if notes.pairs is None else static_periods(notes.pairs)
+    imu, gravity = session.require_imu(), session.gravity
+    notes.rests = find_standstills(imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen)
+    return session
+
+
+PREPARE: Mapping[str, Step] = {
+    "span": choose_span,
+    "gaps": find_imu_gaps,
+    "health": check_health,
+    "calibration": calibrate,
+    "sensors": choose_sensors,
+    "latency": undo_latencies,
+    "holdout": withhold,
+    "outside": drop_outside,
+    "lead": trim_span,
+    "images": pair_images,
+    "standstills": detect_standstills,
+}
+
+
+def _inside(gaps: Sequence[Gap], span: tuple[int, int]) -> list[Gap]:
+    return [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
+
+
+def unused_streams(session: Session) -> list[str]:
+    """Warnings of streams that no factor uses."""
+    used = {factor.stream for factor in FACTORS.values()} | {"reference", "images"}
+    idle = [name for name in session.streams() if name not in used]
+    warnings = [f"{name}: present, not used by the estimator" for name in idle]
+    images = session.images
+    if images is not None and session.matches is None and session.tracks is None and images.file.astype(bool).any():
+        warnings.append(f"images: {len(images)} pictures are not matched yet, and not used; run `smartnav match` first")
+    return warnings
+
+
+def dropped_text(name: str, counts: Mapping[str, int]) -> str:
+    """Warning of rows of a stream that are not used, by reason."""
+    reasons = ", ".join(f"{count} rows {reason}" for reason, count in counts.items())
+    return f"{name}: {reasons}; not used as recorded"
