@@ -127,7 +127,7 @@ class Export(Writing):
                 run.named(self.solution),
                 readers.load(source),
                 self.out,
-                calibration=calibration_model.load(self.run_path / "calibration.toml"),
+                calibration=calibration_model.load_calibration(self.run_path / "calibration.toml"),
                 states=run.summary.get("states"),
                 force=self.force,
                 progress=show,

@@ -17,7 +17,7 @@ class SmartnavError(Exception):
     where : str or Path
         File, stream, option or epoch the fault was found at.
     found : str
-        What stands there, with number and unit.
+        What the value is, with number and unit.
     expected : str, optional
         The rule it breaks.
     remedy : str, optional
@@ -52,7 +52,7 @@ class SmartnavError(Exception):
         super().__init__("; ".join(parts))
 
     def located(self, where: str | Path) -> Self:
-        """The same fault, told of the file it was read from."""
+        """The same fault with the file it was read from."""
         return type(self)(where, self.found, self.expected, self.remedy, row=self.row, stream=self.stream)
 
 

@@ -1,4 +1,4 @@
-"""Reading what people write by hand, and writing that never leaves a half-written file in place of a good one."""
+"""Reading TOML files and tables, and atomic writing: a failure leaves the old file as it was."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it into place only when the block ends well.
 
     Works for files and for folders (create the one wanted at the yielded path). On any failure, an interrupt or a
-    full disk included, the temporary is removed and what stood at `path` is untouched.
+    full disk included, the temporary is removed and `path` is left as it was.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
         raise SessionError(
             path,
             f"could not be written ({error.strerror or error})",
-            "room on the disk and permission to write",
+            "space on the disk and permission to write",
             "nothing was changed; free some space or choose another place",
         ) from error
     finally:
@@ -76,7 +76,7 @@ def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
 def refuse_foreign(path: str | Path, mark: str) -> None:
     """Raise where `path` is a folder with something in it, but not the `mark` file of the kind to be replaced.
 
-    Keeps a mistyped ``--out`` with ``--force`` from replacing a folder of somebody's own.
+    A mistyped ``--out`` with ``--force`` must not replace a folder of another kind.
     """
     path = Path(path)
     if path.exists() and not (path.is_dir() and (not any(path.iterdir()) or (path / mark).is_file())):
@@ -86,12 +86,12 @@ def refuse_foreign(path: str | Path, mark: str) -> None:
 
 
 def write_table(columns: Mapping[str, Column], path: Path) -> None:
-    """Columns -> Parquet."""
+    """Write columns as a Parquet file."""
     pq.write_table(pa.table({name: pa.array(column) for name, column in columns.items()}), path)
 
 
 def read_table(path: Path) -> Table:
-    """Parquet -> columns; empty cells of number columns become NaN.
+    """The columns of a Parquet file; empty cells of number columns become NaN.
 
     Raises
     ------

@@ -103,8 +103,8 @@ def normal_gravity(lat_deg: float, height_m: float) -> float:
 def magnetic_field_ut(origin: Origin, year: float) -> Floats:
     """Flux density (3,) uT of the Earth's field, ENU, at a decimal year.
 
-    World Magnetic Model 2025; outside its five years the secular variation is carried on (0.1 deg and 0.1 uT a year and
-    less in most places), which a phone's magnetometer cannot tell.
+    World Magnetic Model 2025; outside its five years the secular variation is extrapolated (at most 0.1 deg and 0.1 uT
+    a year in most places), which a phone's magnetometer cannot resolve.
     """
     from pygeomag import GeoMag
 

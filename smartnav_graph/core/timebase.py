@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Indices, Times, runs
 from smartnav_graph.core.errors import SessionError
 
 NS = 1_000_000_000
@@ -74,7 +74,7 @@ def interpolate(t_ns: ArrayLike, at_ns: ArrayLike, values: ArrayLike) -> Floats:
     return np.stack([np.interp(x, xp, column) for column in rows.T], axis=-1)
 
 
-def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> NDArray[np.intp]:
+def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> Indices:
     """Index into the sorted `at_ns` of the time nearest to each of `t_ns`."""
     t, at = np.asarray(t_ns, dtype=np.int64), np.asarray(at_ns, dtype=np.int64)
     right = np.clip(np.searchsorted(at, t), 1, max(len(at) - 1, 1))
@@ -83,17 +83,17 @@ def nearest(t_ns: ArrayLike, at_ns: ArrayLike) -> NDArray[np.intp]:
     return np.where(t - at[right - 1] <= at[right] - t, right - 1, right)
 
 
-# Rows between two straight stretches that make them one.
-MENDED_ROWS = 4
+# Stretches separated by at most so many rows are joined.
+JOINED_ROWS = 4
 MISSING_PERIODS = 3.0  # a step longer than so many median periods lacks samples
 STRAIGHT = 1e-3  # rad between successive differences on a straight line
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A stretch without honest inertial data.
+    """A stretch without real inertial data: an IMU data gap.
 
-    kind is ``missing`` (no samples) or ``bridged`` (samples are an exact straight line: somebody interpolated).
+    kind is ``missing`` (no samples) or ``bridged`` (samples lie on an exact straight line: linearly interpolated).
     """
 
     start_ns: int
@@ -112,14 +112,14 @@ def find_gaps(
     missing_s: float = 0.05,
     bridged_rows: int = 5,
 ) -> list[Gap]:
-    """Find missing and straight-line-filled stretches of a sampled signal.
+    """Find missing and linearly interpolated stretches of a sampled signal.
 
     Missing: a step longer than both `missing_s` and `MISSING_PERIODS` median periods.
     Bridged: at least `bridged_rows` successive rows that lie on one straight line of the k-dimensional signal space:
     successive differences, each axis in units of its median step, are parallel within `STRAIGHT` rad, and every
-    axis moves from row to row (constant and quantised stretches do not count). No honest inertial sensor does that,
-    and the rule does not depend on the stamps, which may be jittered. Stretches that a few rows part, as two that were
-    swapped do, are one.
+    axis moves from row to row (constant and quantised stretches do not count). No real inertial sensor does that,
+    and the rule does not depend on the stamps, which may be jittered. Stretches separated by a few rows (two swapped
+    rows, for example) are joined.
 
     Parameters
     ----------
@@ -139,20 +139,17 @@ def find_gaps(
     cosine = np.einsum("ij,ij->i", step[:-1], step[1:]) / np.maximum(length[:-1] * length[1:], 1e-300)
     straight = cosine > np.cos(STRAIGHT)
     moving = (step[1:] != 0.0).all(axis=1)
-    padded = np.concatenate([[False], straight & moving, [False]])
-    starts = np.flatnonzero(~padded[:-1] & padded[1:])
-    ends = np.flatnonzero(padded[:-1] & ~padded[1:])
-    # k parallel pairs span k + 2 rows
-    long = ends - starts + 2 >= bridged_rows
-    gaps += [Gap(int(t_ns[i]), int(t_ns[j]), "bridged") for i, j in _mended(starts[long], ends[long] + 1)]
+    lines = runs(straight & moving) + np.array([0, 1])  # k parallel pairs span k + 2 rows
+    long = lines[np.diff(lines)[:, 0] + 1 >= bridged_rows]
+    gaps += [Gap(int(t_ns[i]), int(t_ns[j]), "bridged") for i, j in _joined(long)]
     return sorted(gaps, key=lambda gap: gap.start_ns)
 
 
-def _mended(first: NDArray[np.intp], last: NDArray[np.intp]) -> list[tuple[int, int]]:
-    """Stretches of rows, joined where hardly any row lies between: two that were swapped break a straight line."""
+def _joined(lines: Indices) -> list[tuple[int, int]]:
+    """First and last rows of the stretches, joined where few rows lie between them: swapped rows break a line."""
     joined: list[tuple[int, int]] = []
-    for i, j in zip(first.tolist(), last.tolist(), strict=True):
-        if joined and i - joined[-1][1] <= MENDED_ROWS:
+    for i, j in lines.tolist():
+        if joined and i - joined[-1][1] <= JOINED_ROWS:
             joined[-1] = (joined[-1][0], j)
         else:
             joined.append((i, j))

@@ -157,7 +157,7 @@ class PositionBuilder(Builder):
         """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
         `LEAST_WANDERING_SIGMA`. Better ones come from carrier phase, whose errors do not wander by metres."""
         typical = float(np.median(self.scaled_sigma(pass_state)[:, :2]))
-        return self.noise.wanders and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
+        return self.noise.is_correlated and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scale of this sensor."""

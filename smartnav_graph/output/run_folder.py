@@ -121,7 +121,7 @@ def write_run(
             progress("writing tables", 0, 0)
             _write_tables(run, folder)
             (folder / "config.toml").write_text(config_model.dumps(run.problem.config), encoding="utf-8")
-            calibration = calibration_model.dumps(run.problem.calibration)
+            calibration = calibration_model.calibration_toml(run.problem.calibration)
             (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
             _write_views(run, folder, plain(told), evaluation, report, recording, progress)
             summary = plain(_timed(told, load_s, time.perf_counter() - begin))

@@ -16,7 +16,7 @@ from smartnav_graph.core.files import read_table, read_toml, replacing, write_ta
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.session import repair
-from smartnav_graph.session.calibration import model as calibration_model
+from smartnav_graph.session.calibration.model import calibration_toml, load_calibration
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
@@ -32,7 +32,7 @@ def save(session: Session, path: str | Path, *, force: bool = False, progress: P
         for name, stream in watched("writing streams", list(session.streams().items()), progress):
             write_table(stream.columns(), folder / f"{name}.parquet")
         if session.calibration is not None:
-            (folder / "calibration.toml").write_text(calibration_model.dumps(session.calibration), encoding="utf-8")
+            (folder / "calibration.toml").write_text(calibration_toml(session.calibration), encoding="utf-8")
         _copy_pictures(session, folder / PICTURES, progress)
         (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
 
@@ -99,7 +99,7 @@ def read_header(folder: Path) -> dict[str, Any]:
             "origin": Origin(**raw["origin"]) if raw.get("origin") else None,
             "gravity_m_s2": gravity,
             "sensors": {name: Mount(**_tuples(mount)) for name, mount in raw.get("sensors", {}).items()},
-            "calibration": calibration_model.load(folder / raw["calibration"]) if "calibration" in raw else None,
+            "calibration": load_calibration(folder / raw["calibration"]) if "calibration" in raw else None,
             "repairs": repair.check_names(raw.get("repair", ())),
         }
     except TypeError as error:

@@ -1,4 +1,4 @@
-"""Rows kept from the smoother on purpose, to be scored afterwards."""
+"""Withheld rows: kept from the smoother on purpose, to be scored afterwards."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
@@ -45,7 +45,7 @@ class Withhold:
             pass
         raise ConfigError("--withhold", f"{text!r}", EXPECTED)
 
-    def kept(self, t_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def kept(self, t_s: Floats) -> Mask:
         """Mask (n,) of the rows that stay, by their seconds since time zero."""
         if self.every is not None:
             return np.asarray(np.arange(len(t_s)) % self.every == 0)
@@ -61,13 +61,13 @@ def split(session: Session, specs: Iterable[str]) -> tuple[Session, dict[str, Po
     ConfigError
         A specification that cannot be read, or names a stream of positions that the session does not have.
     """
-    kept: dict[str, NDArray[np.bool_]] = {}
+    kept: dict[str, Mask] = {}
     for spec in (Withhold.parse(text) for text in specs):
         stream = session.streams().get(spec.sensor)
         if not isinstance(stream, Positioned):
-            there = list(session.positions())
+            found = list(session.positions())
             raise ConfigError(
-                "--withhold", f"no stream of positions {spec.sensor!r}", f"one of {', '.join(there) or 'none here'}"
+                "--withhold", f"no stream of positions {spec.sensor!r}", f"one of {', '.join(found) or 'none here'}"
             )
         mask = spec.kept(session.seconds(stream.t_ns))
         kept[spec.sensor] = kept.get(spec.sensor, np.ones(len(stream), dtype=bool)) & mask

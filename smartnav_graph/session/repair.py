@@ -1,4 +1,4 @@
-"""Named, counted repairs of faulty tables. Applied only when asked for; the file on disk stays as it is.
+"""Named, counted repairs of faulty tables. Applied only on request; the file on disk is not changed.
 
 =========  ==========================================================================================
 ``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped
@@ -10,24 +10,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from smartnav_graph.core.arrays import Column, Indices, Mask, Table, Times
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import Imu
 
-Table = dict[str, NDArray[Any]]
-
 REPAIRS = ("nan", "stamps", "order")
 
 
 def check_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The repairs asked for, in the order they are applied.
+    """The wanted repairs, in the order of application.
 
     Raises
     ------
@@ -41,7 +38,7 @@ def check_names(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in REPAIRS if name in wanted)
 
 
-def repair(kind: type[Stream], table: Mapping[str, NDArray[Any]], names: Iterable[str]) -> tuple[Table, dict[str, int]]:
+def repair(kind: type[Stream], table: Mapping[str, Column], names: Iterable[str]) -> tuple[Table, dict[str, int]]:
     """Apply `names` to the columns of one stream.
 
     Returns
@@ -58,7 +55,7 @@ def repair(kind: type[Stream], table: Mapping[str, NDArray[Any]], names: Iterabl
     return rows, counts
 
 
-def _keep(rows: Table, chosen: NDArray[Any]) -> Table:
+def _keep(rows: Table, chosen: Mask | Indices) -> Table:
     return {name: np.asarray(column)[chosen] for name, column in rows.items()}
 
 
@@ -89,10 +86,10 @@ def _sort(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
 
 
 def _rebuild_stamps(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
-    """Only inertial samples come at a steady rate; the stamps of events (fixes, standstills) are what they are."""
+    """Only inertial samples come at a steady rate; the stamps of events (fixes, standstills) are kept."""
     if kind is not Imu:
         return rows, {}
-    # a row delivered twice would push its neighbours aside
+    # a row delivered twice would shift its neighbours
     first = np.concatenate([[True], np.diff(np.asarray(rows["t_ns"], dtype=np.int64)) != 0])
     rows = _keep(rows, first)
     t = np.asarray(rows["t_ns"], dtype=np.int64)
@@ -100,7 +97,7 @@ def _rebuild_stamps(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, i
     return rows | {"t_ns": rebuilt}, {"repeated stamps dropped": int((~first).sum()), "stamps rebuilt": len(t)}
 
 
-def _breaks(t: NDArray[np.int64]) -> NDArray[np.intp]:
+def _breaks(t: Times) -> Indices:
     """Rows after a step that jitter cannot explain: 8 robust sigmas of the steps (and 10 periods) above the median."""
     step = np.diff(t)
     if not len(step):
@@ -110,7 +107,7 @@ def _breaks(t: NDArray[np.int64]) -> NDArray[np.intp]:
     return np.asarray(np.flatnonzero(step > median + max(8.0 * sigma, 10.0 * median)) + 1)
 
 
-def _steady(t: NDArray[np.int64]) -> NDArray[np.int64]:
+def _steady(t: Times) -> Times:
     """4 s moving mean of stamps in row order, about their straight line of least squares."""
     if len(t) < 3:
         return t

@@ -1,4 +1,4 @@
-"""A recorded session: device + streams + reference. The folder on disk and this object are the same thing."""
+"""A recorded session: device, streams and reference; see `folder` for its files."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Device:
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits: `body_t` (3,) m its origin in body axes, `body_R` (3, 3) its axes; `frame` a free mark.
+    """Where a sensor is mounted: `body_t` (3,) m its origin in body axes, `body_R` (3, 3) its axes; `frame` a label.
 
-    For position sensors ``frame = "msl"`` says that heights count from mean sea level.
+    For position sensors ``frame = "msl"`` says that heights are above mean sea level.
     """
 
     body_t: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -139,7 +139,7 @@ class Session(Streams):
 
     @property
     def year(self) -> float:
-        """Decimal year of time zero; 2025 where the clock tells no date."""
+        """Decimal year of time zero; 2025 where the clock is no date."""
         unix_s = self.t0_ns / NS + (GPS_EPOCH_S if self.clock_epoch == "gps" else 0.0)
         return 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
 
@@ -156,7 +156,7 @@ class Session(Streams):
         return float(np.degrees(np.arctan2(*self.magnetic_field_ut[:2])))
 
     def mount(self, sensor: str) -> Mount:
-        """Where `sensor` sits; at the body origin when the session does not say."""
+        """Where `sensor` is mounted; the body origin where the session does not give it."""
         return self.sensors.get(sensor, Mount())
 
     def lever_arms(self, stream: Positioned) -> NDArray[np.float64]:
@@ -165,7 +165,7 @@ class Session(Streams):
         Raises
         ------
         SessionError
-            A row names a sensor of which the session does not know where it sits.
+            A row names a sensor without mount in the session.
         """
         named = getattr(stream, "sensor", None)
         names = np.full(len(stream), stream.NAME, dtype=object) if named is None else named
@@ -173,7 +173,7 @@ class Session(Streams):
             if named is not None and name and name not in self.sensors:
                 raise SessionError(
                     stream.NAME,
-                    f"row {row} was taken with {name!r}, which session.toml does not place",
+                    f"row {row} was taken with {name!r}, which has no mount in session.toml",
                     f"[sensors.{name}] with body_t",
                     "add it, or leave the cell empty for the sensor head itself",
                     row=row,

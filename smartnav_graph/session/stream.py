@@ -1,7 +1,7 @@
-"""What every stream is: a frozen dataclass of typed columns, one field a quantity, one file a stream.
+"""The base of every stream: a frozen dataclass of typed columns, one field per quantity, one file per stream.
 
 Rows are samples; arrays are read-only; every field declares its file columns, so that the table on disk and the
-object in memory are the same thing. A stream checks itself when it is built: shapes, finite values, time order.
+object in memory hold the same. A stream checks itself when it is built: shapes, finite values, time order.
 """
 
 from __future__ import annotations
@@ -11,23 +11,23 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from smartnav_graph.core.arrays import Column, Floats, Indices, Mask, Table, Times
 from smartnav_graph.core.errors import SessionError
-
-Array = NDArray[Any]
 
 _DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
 
 
 def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool = False) -> Any:
-    """A field stored as the file columns `names`; `nan` marks a quantity whose rows may be unknown."""
+    """A field stored as the file columns `names`; `nan` allows unknown rows."""
     meta = {"columns": names, "kind": kind, "nan": nan}
     return field(metadata=meta) if not optional else field(default=None, metadata=meta)
 
 
-def axes(template: str, axes: str = "xyz", **kwargs: Any) -> Any:
-    return quantity(*(template.format(axis) for axis in axes), **kwargs)
+def axes(template: str, names: str = "xyz", *, optional: bool = False, nan: bool = False) -> Any:
+    """A vector stored as one file column per axis: ``{}`` in `template` becomes its name."""
+    return quantity(*(template.format(name) for name in names), optional=optional, nan=nan)
 
 
 class Label(NamedTuple):
@@ -61,15 +61,15 @@ class Stream:
     UNIQUE_TIMES: ClassVar[bool] = True
     ONE_OF: ClassVar[tuple[str, ...]] = ()
 
-    t_ns: NDArray[np.int64] = quantity("t_ns", kind="int")
-    arrival_ns: NDArray[np.int64] | None = quantity("arrival_ns", kind="int", optional=True)
-    extra: Mapping[str, Array] = field(default_factory=dict)
+    t_ns: Times = quantity("t_ns", kind="int")
+    arrival_ns: Times | None = quantity("arrival_ns", kind="int", optional=True)
+    extra: Mapping[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.t_ns)
 
     @property
-    def available_ns(self) -> NDArray[np.int64]:
+    def available_ns(self) -> Times:
         """When each row (n,) became known."""
         return self.t_ns if self.arrival_ns is None else self.arrival_ns
 
@@ -85,9 +85,9 @@ class Stream:
         """The fields that are file columns."""
         return [f for f in fields(cls) if "columns" in f.metadata]
 
-    def _checked(self, spec: Field[Any], value: Any) -> Array:
+    def _checked(self, spec: Field[Any], value: ArrayLike) -> Column:
         names, kind = spec.metadata["columns"], spec.metadata["kind"]
-        array: Array = np.array(value, dtype=_DTYPES[kind])
+        array: Column = np.array(value, dtype=_DTYPES[kind])
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
         if array.shape != shape:
             raise SessionError(
@@ -135,7 +135,7 @@ class Stream:
             raise SessionError(
                 self.NAME,
                 f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)",
-                "a row becomes known at or after the time it speaks of",
+                "arrival at or after the time of the measurement",
                 "correct the column, or leave it out",
                 row=row,
                 stream=self.NAME,
@@ -154,15 +154,15 @@ class Stream:
                         stream=self.NAME,
                     )
 
-    def take(self, rows: NDArray[Any] | slice) -> Self:
+    def take(self, rows: Mask | Indices | slice) -> Self:
         """The same stream with only these rows (mask, indices or slice)."""
         values = {f.name: getattr(self, f.name) for f in self.specs()}
         chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
         return type(self)(**chosen, extra={name: value[rows] for name, value in self.extra.items()})
 
-    def columns(self) -> dict[str, Array]:
+    def columns(self) -> Table:
         """File columns, in order; the inverse of `from_columns`."""
-        out: dict[str, Array] = {}
+        out: Table = {}
         for spec in self.specs():
             value = getattr(self, spec.name)
             if value is None:
@@ -172,7 +172,7 @@ class Stream:
         return out | dict(self.extra)
 
     @classmethod
-    def from_columns(cls, table: Mapping[str, Array]) -> Self:
+    def from_columns(cls, table: Mapping[str, Column]) -> Self:
         """Build from file columns. Unknown columns are kept in `extra`.
 
         Raises
@@ -184,12 +184,12 @@ class Stream:
         known: set[str] = set()
         for spec in cls.specs():
             names = spec.metadata["columns"]
-            there = [name for name in names if name in table]
-            known.update(there)
-            if len(there) == len(names):
-                rows: list[Array] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
+            found = [name for name in names if name in table]
+            known.update(found)
+            if len(found) == len(names):
+                rows: list[Column] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
                 values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
-            elif there or spec.default is MISSING:
+            elif found or spec.default is MISSING:
                 missing = [name for name in names if name not in table]
                 raise SessionError(
                     cls.NAME,
@@ -213,6 +213,6 @@ class Positioned(Stream):
     AIDING: ClassVar[bool] = True
     ONE_OF: ClassVar[tuple[str, ...]] = ("lla", "enu")
 
-    lla: Array | None = quantity(*LLA, optional=True)
-    enu: Array | None = quantity(*ENU, optional=True)
-    sigma: Array | None = axes("sigma_{}_m", "enu", optional=True, nan=True)
+    lla: Floats | None = quantity(*LLA, optional=True)
+    enu: Floats | None = quantity(*ENU, optional=True)
+    sigma: Floats | None = axes("sigma_{}_m", "enu", optional=True, nan=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-
-from smartnav_graph.session.stream import ENU, Array, Label, Positioned, Stream, axes, quantity
+from smartnav_graph.core.arrays import Floats, Texts, Times
+from smartnav_graph.session.stream import ENU, Label, Positioned, Stream, axes, quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,8 +16,8 @@ class Imu(Stream):
     NAME: ClassVar[str] = "imu"
     LABEL: ClassVar[Label] = Label("IMU", "IMU sample", "IMU samples", "the inertial data", colour=(235, 80, 80))
 
-    gyro: Array = axes("gyro_{}_rad_s")
-    accel: Array = axes("accel_{}_m_s2")
+    gyro: Floats = axes("gyro_{}_rad_s")
+    accel: Floats = axes("accel_{}_m_s2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,20 +27,20 @@ class GnssFix(Positioned):
     NAME: ClassVar[str] = "gnss"
     LABEL: ClassVar[Label] = Label("GNSS", "GNSS fix", "GNSS fixes", colour=(80, 200, 120))
 
-    velocity: Array | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
-    sigma_velocity: Array | None = quantity("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
-    fix_type: Array | None = quantity("fix_type", optional=True, kind="int")
+    velocity: Floats | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
+    sigma_velocity: Floats | None = quantity("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
+    fix_type: Times | None = quantity("fix_type", optional=True, kind="int")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControlPoint(Positioned):
-    """Surveyed points the sensor head stood on."""
+    """Surveyed points at which the sensor head was placed."""
 
     NAME: ClassVar[str] = "control"
     LABEL: ClassVar[Label] = Label("Control points", "control point", "control points", colour=(255, 130, 200))
 
-    point_id: Array = quantity("point_id", kind="text")
-    sensor: Array | None = quantity("sensor", optional=True, kind="text")
+    point_id: Texts = quantity("point_id", kind="text")
+    sensor: Texts | None = quantity("sensor", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +51,9 @@ class PoseFix(Positioned):
     LABEL: ClassVar[Label] = Label("Pose fixes", "pose fix", "pose fixes", colour=(60, 210, 210))
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    quat: Array | None = quantity("qw", "qx", "qy", "qz", optional=True, nan=True)
-    sigma_rot: Array | None = axes("sigma_{}_rad", "enu", optional=True, nan=True)
-    source: Array | None = quantity("source", optional=True, kind="text")
+    quat: Floats | None = quantity("qw", "qx", "qy", "qz", optional=True, nan=True)
+    sigma_rot: Floats | None = axes("sigma_{}_rad", "enu", optional=True, nan=True)
+    source: Texts | None = quantity("source", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +64,9 @@ class StaticPeriod(Stream):
     LABEL: ClassVar[Label] = Label("Standstills", "standstill", "standstills")
     AIDING: ClassVar[bool] = True
 
-    t_end_ns: NDArray[np.int64] = quantity("t_end_ns", kind="int")
-    sigma_v: Array | None = quantity("sigma_v_m_s", optional=True)
-    source: Array | None = quantity("source", optional=True, kind="text")
+    t_end_ns: Times = quantity("t_end_ns", kind="int")
+    sigma_v: Floats | None = quantity("sigma_v_m_s", optional=True)
+    source: Texts | None = quantity("source", optional=True, kind="text")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +77,7 @@ class Magnetometer(Stream):
     LABEL: ClassVar[Label] = Label("Magnetometer", "magnetometer sample", "magnetometer samples", "the magnetometer")
     AIDING: ClassVar[bool] = True
 
-    field_ut: Array = axes("mag_{}_ut")
+    field_ut: Floats = axes("mag_{}_ut")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +88,7 @@ class Barometer(Stream):
     LABEL: ClassVar[Label] = Label("Barometer", "pressure sample", "pressure samples", "the barometer")
     AIDING: ClassVar[bool] = True
 
-    pressure_hpa: Array = quantity("pressure_hpa")
+    pressure_hpa: Floats = quantity("pressure_hpa")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +98,7 @@ class Temperature(Stream):
     NAME: ClassVar[str] = "temperature"
     LABEL: ClassVar[Label] = Label("Temperature", "temperature sample", "temperature samples")
 
-    temperature_c: Array = quantity("temperature_c")
+    temperature_c: Floats = quantity("temperature_c")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,8 +109,8 @@ class Velocity(Stream):
     LABEL: ClassVar[Label] = Label("Velocity", "velocity", "velocities", "the measured velocities")
     AIDING: ClassVar[bool] = True
 
-    velocity: Array = axes("v_{}_m_s")
-    sigma: Array | None = axes("sigma_v{}_m_s", optional=True)
+    velocity: Floats = axes("v_{}_m_s")
+    sigma: Floats | None = axes("sigma_v{}_m_s", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +121,8 @@ class WheelSpeed(Stream):
     LABEL: ClassVar[Label] = Label("Wheel speed", "wheel speed", "wheel speeds", "the wheel")
     AIDING: ClassVar[bool] = True
 
-    speed: Array = quantity("speed_m_s")
-    sigma: Array | None = quantity("sigma_m_s", optional=True)
+    speed: Floats = quantity("speed_m_s")
+    sigma: Floats | None = quantity("sigma_m_s", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,11 +133,11 @@ class Images(Stream):
     LABEL: ClassVar[Label] = Label("Images", "image", "images")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id: Array = quantity("image_id", kind="int")
-    file: Array = quantity("file", kind="text")
-    camera: Array = quantity("camera", kind="text")
-    exposure_ns: Array | None = quantity("exposure_ns", optional=True, kind="int")
-    readout_ns: Array | None = quantity("readout_ns", optional=True, kind="int")
+    image_id: Times = quantity("image_id", kind="int")
+    file: Texts = quantity("file", kind="text")
+    camera: Texts = quantity("camera", kind="text")
+    exposure_ns: Times | None = quantity("exposure_ns", optional=True, kind="int")
+    readout_ns: Times | None = quantity("readout_ns", optional=True, kind="int")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,10 +148,10 @@ class Tracks(Stream):
     LABEL: ClassVar[Label] = Label("Tracked points", "tracked point", "tracked points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id: Array = quantity("image_id", kind="int")
-    track_id: Array = quantity("track_id", kind="int")
-    xy_n: Array = quantity("x_n", "y_n")
-    xy_px: Array | None = quantity("x_px", "y_px", optional=True)
+    image_id: Times = quantity("image_id", kind="int")
+    track_id: Times = quantity("track_id", kind="int")
+    xy_n: Floats = quantity("x_n", "y_n")
+    xy_px: Floats | None = quantity("x_px", "y_px", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +162,12 @@ class Matches(Stream):
     LABEL: ClassVar[Label] = Label("Matched points", "matched point", "matched points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
-    image_id_0: Array = quantity("image_id_0", kind="int")
-    image_id_1: Array = quantity("image_id_1", kind="int")
-    t_1_ns: Array = quantity("t_ns_1", kind="int")
-    xy0_n: Array = quantity("x0_n", "y0_n")
-    xy1_n: Array = quantity("x1_n", "y1_n")
-    score: Array | None = quantity("score", optional=True)
+    image_id_0: Times = quantity("image_id_0", kind="int")
+    image_id_1: Times = quantity("image_id_1", kind="int")
+    t_1_ns: Times = quantity("t_ns_1", kind="int")
+    xy0_n: Floats = quantity("x0_n", "y0_n")
+    xy1_n: Floats = quantity("x1_n", "y1_n")
+    score: Floats | None = quantity("score", optional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +177,12 @@ class Reference(Stream):
     NAME: ClassVar[str] = "reference"
     LABEL: ClassVar[Label] = Label("Reference", "reference position", "reference positions")
 
-    enu: Array = quantity(*ENU)
-    quat: Array | None = quantity("qw", "qx", "qy", "qz", optional=True)
-    velocity: Array | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True)
-    accel_bias: Array | None = axes("accel_bias_{}_m_s2", optional=True)
-    gyro_bias: Array | None = axes("gyro_bias_{}_rad_s", optional=True)
-    sigma: Array | None = axes("sigma_{}_m", "enu", optional=True, nan=True)
+    enu: Floats = quantity(*ENU)
+    quat: Floats | None = quantity("qw", "qx", "qy", "qz", optional=True)
+    velocity: Floats | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True)
+    accel_bias: Floats | None = axes("accel_bias_{}_m_s2", optional=True)
+    gyro_bias: Floats | None = axes("gyro_bias_{}_rad_s", optional=True)
+    sigma: Floats | None = axes("sigma_{}_m", "enu", optional=True, nan=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +205,7 @@ class Streams:
     reference: Reference | None = None
 
     def streams(self) -> dict[str, Stream]:
-        """The streams that are there, by name."""
+        """The streams that exist, by name."""
         return {name: stream for name in STREAMS if (stream := getattr(self, name)) is not None}
 
     def absolute(self) -> dict[str, Stream]:

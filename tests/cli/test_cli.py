@@ -189,7 +189,7 @@ def test_info_of_a_degraded_session(call, tmp_path):
     assert code == 0
     assert re.search(r"gnss +60 +0\.000 +59\.000 +1\.00", out)
     assert "missing 2.010 s at 19.990 s" in out
-    assert "6 non-finite rows dropped" in out and "warning: imu: 1 stretch without samples" in out
+    assert "6 non-finite rows dropped" in out and "warning: imu: 1 data gap without samples" in out
 
 
 def test_degrading_twice_with_one_seed_gives_the_same(call, tmp_path):

@@ -70,7 +70,7 @@ def test_a_full_disk_is_told_and_leaves_the_old(target):
     with pytest.raises(SessionError) as e:
         break_off(path, kind, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     assert str(e.value) == (
-        f"{path}: could not be written (No space left on device); expected room on the disk and permission to write; "
+        f"{path}: could not be written (No space left on device); expected space on the disk and permission to write; "
         "nothing was changed; free some space or choose another place"
     )
     assert read(path) == "old" and names(path.parent) == ["result"]

@@ -121,7 +121,7 @@ def test_summary_is_plain_json_with_load_and_write_in_the_timings(run, tmp_path)
 def test_config_and_calibration_are_those_of_the_run(run, session, tmp_path):
     write_run(run, tmp_path / "run", report=False, recording=False)
     assert config.load(tmp_path / "run" / "config.toml") == run.problem.config
-    assert calibration_model.load(tmp_path / "run" / "calibration.toml") == session.calibration
+    assert calibration_model.load_calibration(tmp_path / "run" / "calibration.toml") == session.calibration
     assert tomllib.loads((tmp_path / "run" / "config.toml").read_text())["run"]["withhold"] == ["gnss:every=2"]
 
 

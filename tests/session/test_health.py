@@ -80,7 +80,7 @@ def test_accelerometer_in_g_and_scaled_twice():
     warning = only(inspect(make_session(imu=scaled(make_imu(), accel=1 / G))), "warning")
     assert "units of g" in warning and "multiply accel by 9.80665" in warning
     warning = only(inspect(make_session(imu=scaled(make_imu(), accel=G))), "warning")
-    assert "9.81 once too often" in warning and "divide accel by 9.80665" in warning
+    assert "scaled by 9.81 twice" in warning and "divide accel by 9.80665" in warning
 
 
 def test_gravity_removed_and_other_factors():
@@ -264,8 +264,8 @@ def test_gaps_are_told_by_kind():
         accel[row], gyro[row] = (1 - f) * accel[2000] + f * accel[2050], (1 - f) * gyro[2000] + f * gyro[2050]
     health = inspect(make_session(imu=replace(imu, accel=accel, gyro=gyro).take(kept)))
     missing, bridged = health.warnings()
-    assert "1 stretch without samples, 2.01 s in all, longest 2.01 s at 9.99 s" in missing
-    assert "1 stretch filled by straight lines, 0.50 s in all, longest 0.50 s at 20.00 s" in bridged
+    assert "1 data gap without samples, 2.01 s in all, longest 2.01 s at 9.99 s" in missing
+    assert "1 data gap linearly interpolated, 0.50 s in all, longest 0.50 s at 20.00 s" in bridged
     assert [gap.kind for gap in health.gaps] == ["missing", "bridged"]
 
 
@@ -276,7 +276,7 @@ def test_sigmas_heights_and_repairs_are_told():
     assert {finding.level for finding in inspect(session).findings} == {"info"}
     assert told == [
         "gnss: has no sigma columns; the default of the device class will be used",
-        "gnss: heights count from mean sea level, not from the ellipsoid",
+        "gnss: heights are above mean sea level, not above the ellipsoid",
         "imu: 3 rows sorted",
     ]
     sigma = np.array(make_fixes().sigma)
@@ -308,7 +308,7 @@ def unit_alarms(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray, up: str = "+
     rows = np.r_[True, np.diff(t) > 0]
     imu = Imu(t_ns=ns_from_seconds(t - t[0])[rows], gyro=gyro[rows], accel=accel[rows])
     told = inspect(Session(imu=imu, gravity_m_s2=G, device=Device(up=up))).warnings()
-    return [warning for warning in told if "stretch" not in warning and "absolute" not in warning]
+    return [warning for warning in told if "data gap" not in warning and "absolute" not in warning]
 
 
 @real

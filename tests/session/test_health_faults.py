@@ -89,13 +89,13 @@ def mirrored_field(session: Session) -> Session:
     return changed(session, "magnetometer", field_ut=session.magnetometer.field_ut * [1.0, -1.0, 1.0])
 
 
-def hung_field(session: Session) -> Session:
+def frozen_field(session: Session) -> Session:
     field = np.array(session.magnetometer.field_ut)
     field[500:700] = field[500]
     return changed(session, "magnetometer", field_ut=field)
 
 
-def hung_imu(session: Session) -> Session:
+def frozen_imu(session: Session) -> Session:
     gyro, accel = np.array(session.imu.gyro), np.array(session.imu.accel)
     gyro[3000:3300], accel[3000:3300] = gyro[3000], accel[3000]
     return changed(session, "imu", gyro=gyro, accel=accel)
@@ -135,15 +135,15 @@ def kelvin(session: Session) -> Session:
 CAR, WALK = "car-all-2min", "walk-all-2min"
 FAULTS = [
     ("car-10min", scaled("imu", "gyro", -1.0), "imu: gyro turns against", "flip the sign of gyro"),
-    (WALK, scaled("imu", "gyro", -1.0), "or gyro has the wrong sign", "right-handed"),
+    (WALK, scaled("imu", "gyro", -1.0), "or the sign of gyro is wrong", "right-handed"),
     (CAR, scaled("imu", "gyro", np.pi / 180), "converted from deg to rad twice", "multiply gyro by 180/pi"),
     (WALK, scaled("imu", "gyro", np.pi / 180), "converted from deg to rad twice", "multiply gyro by 180/pi"),
     (CAR, scaled("imu", "gyro", 180 / np.pi), "it looks like deg/s", "multiply gyro by pi/180"),
     (CAR, scaled("imu", "accel", 1 / 9.80665), "units of g", "multiply accel by 9.80665"),
     (CAR, scaled("imu", "accel", -1.0), "specific force points up", "flip the sign of accel"),
-    (CAR, hung_imu, "imu: repeats one row of readings for 3.0 s in 1 stretch", "count as a gap"),
+    (CAR, frozen_imu, "imu: repeats one row of readings for 3.0 s in 1 stretch", "count as a gap"),
     (CAR, dead_axis, "imu: gyro y is 0 in all", "import the log again"),
-    (CAR, clipped, "|accel| stands at 19.61", "larger range"),
+    (CAR, clipped, "|accel| is 19.61 in", "larger range"),
     (CAR, exchanged, "and near it with latitude and longitude exchanged", "exchange lat_deg and lon_deg"),
     (CAR, radians, "they look like radians", "give degrees"),
     (CAR, no_heights, "gnss: height_m is zero in all rows", "holds no heights"),
@@ -155,7 +155,7 @@ FAULTS = [
     ),
     (CAR, scaled("gnss", "velocity", -1.0), "gnss: velocity points against the motion", "flip its sign"),
     (CAR, turned_velocity, "gnss: velocity fits the fixes with east and north exchanged", "exchange ve and vn"),
-    (CAR, frozen_receiver, "gnss: repeats one position for 29 s", "the receiver hung"),
+    (CAR, frozen_receiver, "gnss: repeats one position for 29 s", "receiver output frozen"),
     (CAR, sea_level, "gnss: heights lie +46", 'frame = "msl"'),
     (CAR, scaled("wheel", "speed", 3.6), "wheel: speed is 3.6", "give m/s"),
     (CAR, scaled("wheel", "speed", 1.944), "it looks like knots", "give m/s"),
@@ -171,7 +171,7 @@ FAULTS = [
     (CAR, scaled("magnetometer", "field_ut", 1e-6), "it looks like tesla", "give uT"),
     (CAR, scaled("magnetometer", "field_ut", 1000.0), "it looks like nanotesla", "give uT"),
     (CAR, scaled("magnetometer", "field_ut", -1.0), "magnetometer: field points", "flip the sign of all axes"),
-    (CAR, hung_field, "magnetometer: repeats one reading for 20 s", "it hung"),
+    (CAR, frozen_field, "magnetometer: repeats one reading for 20 s", "sensor output frozen"),
     (CAR, mirrored_field, "magnetometer: field turns against gyro", "right-handed"),
     (WALK, quaternion_last, "pose_fixes: attitudes turn", "give qw, qx, qy, qz"),
     (WALK, inverse_quaternion, "if read inverted", "give qw, qx, qy, qz"),

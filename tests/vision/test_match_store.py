@@ -158,7 +158,7 @@ def test_what_the_command_refuses(folder, capsys, monkeypatch, arguments, code, 
 
 
 def test_a_camera_without_calibration_cannot_read_match_files(folder, tmp_path, capsys):
-    (folder / "calibration.toml").write_text(calibration_model.dumps(calibration_model.Calibration()))
+    (folder / "calibration.toml").write_text(calibration_model.calibration_toml(calibration_model.Calibration()))
     code, _, err = call(capsys, "match", folder, "--to-file", tmp_path / "m.txt")
     assert code == 1 and "knows no camera cam0; expected [cameras.cam0]" in err
 

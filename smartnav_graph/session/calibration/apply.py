@@ -1,4 +1,4 @@
-"""Deterministic errors taken out of readings, once, before anything else is done with them."""
+"""Correction of inertial readings for the deterministic errors of the calibration."""
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -27,10 +26,10 @@ class Camera:
     """Interior orientation of one camera.
 
     model : ``brown`` (k1, k2, p1, p2[, k3[, k4, k5, k6]]) or ``fisheye`` (k1 .. k4)
-    width, height : px, of the images it speaks of; fx, fy, cx, cy : px
-    noise_px : sigma of a good match, px an axis; time_offset_s : a frame stamped t shows IMU time t + offset;
+    width, height : px, of the images; fx, fy, cx, cy : px
+    noise_px : sigma of an inlier match, px per axis; time_offset_s : a frame stamped t shows IMU time t + offset;
     readout_s : from the first row to the last, 0 for a global shutter
-    boresight_sigma_deg, time_offset_sigma_s : how sure its attitude in the body (of the session) and its clock are
+    boresight_sigma_deg, time_offset_sigma_s : sigmas of its attitude in the body (in the session) and of its clock
     """
 
     width: int
@@ -77,7 +76,7 @@ class Camera:
 
     @property
     def noise(self) -> float:
-        """Sigma of a good match in normalised coordinates."""
+        """Sigma of an inlier match in normalised coordinates."""
         return self.noise_px / self.focal
 
     def normalised(self, xy_px: Floats) -> Floats:
@@ -108,7 +107,7 @@ class Camera:
             found, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, self._brown())
         return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
-    def _brown(self) -> Any:
+    def _brown(self) -> Floats:
         return np.array(self.distortion) if self.distortion else np.zeros(5)
 
     def resized(self, width: int, height: int) -> Camera:

@@ -1,4 +1,4 @@
-"""What is known of a device: noise of its sensors and, later, their deterministic errors; <-> calibration.toml.
+"""Calibration of a device: noise and deterministic errors of its sensors, as in calibration.toml.
 
 Noise densities follow IEEE Std 952: white noise in unit/sqrt(Hz), bias random walk in unit*sqrt(Hz) per second.
 """
@@ -19,10 +19,13 @@ from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.session.calibration.camera import Camera
 
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Inertial noise that the estimator assumes (not the data sheet's: vibration, quantisation, scale errors included).
+    """Inertial noise as the estimator assumes it; it covers vibration, quantisation and scale errors, other than data
+    sheets.
 
     accel_noise_density m/s^2/sqrt(Hz), gyro_noise_density rad/s/sqrt(Hz), accel_bias_walk m/s^3/sqrt(Hz),
     gyro_bias_walk rad/s^2/sqrt(Hz); turn-on bias sigmas m/s^2 and rad/s.
@@ -40,10 +43,10 @@ class ImuNoise:
 class GnssNoise:
     """Noise of position fixes, metres.
 
-    horizontal_sigma, vertical_sigma : white part of fixes that carry no sigma of their own
+    horizontal_sigma, vertical_sigma : white part of fixes without sigma
     correlated_horizontal_sigma, correlated_vertical_sigma, correlated_time : first-order Gauss-Markov part of code
-    receivers, m and s; zero sigma for a receiver whose errors do not wander
-    velocity_horizontal_sigma, velocity_vertical_sigma : m/s, of velocities that carry no sigma of their own
+    receivers, m and s; zero sigma for a receiver without correlated errors
+    velocity_horizontal_sigma, velocity_vertical_sigma : m/s, of velocities without sigma
     """
 
     horizontal_sigma: float = 3.0
@@ -55,20 +58,21 @@ class GnssNoise:
     velocity_vertical_sigma: float = 0.5
 
     @property
-    def wanders(self) -> bool:
+    def is_correlated(self) -> bool:
+        """Whether the fixes have a Gauss-Markov part."""
         return self.correlated_horizontal_sigma > 0 and self.correlated_vertical_sigma > 0
 
 
 @dataclass(frozen=True)
 class VehicleNoise:
-    """Speeds (m/s) that a vehicle on wheels should not have and has: sideways, up, and of its wheels over the road."""
+    """Sigmas m/s of the constraints of a vehicle on wheels: speed sideways and up, error of the wheel speed."""
 
     lateral_sigma: float
     vertical_sigma: float
     wheel_sigma: float
 
 
-# One default a vehicle on wheels. Castors follow the push, and a trolley's load rocks, at a tenth of a car's speed.
+# One default per vehicle on wheels. A trolley's castors slip and its load rocks, at a tenth of a car's speed.
 VEHICLE_CLASSES: dict[str, VehicleNoise] = {
     "car": VehicleNoise(lateral_sigma=0.15, vertical_sigma=0.15, wheel_sigma=0.1),
     "trolley": VehicleNoise(lateral_sigma=0.1, vertical_sigma=0.05, wheel_sigma=0.05),
@@ -85,7 +89,7 @@ class BarometerNoise:
 
 @dataclass(frozen=True)
 class PoseFixNoise:
-    """Pose fixes that carry no sigma of their own, as of image recognition: position m, attitude rad, each an axis."""
+    """Sigmas per axis of pose fixes without sigma, as of image recognition: position m, attitude rad."""
 
     position_sigma: float = 0.3
     attitude_sigma: float = 0.035
@@ -93,7 +97,7 @@ class PoseFixNoise:
 
 @dataclass(frozen=True)
 class StepNoise:
-    """What is known of a walker before the first step.
+    """Prior on the step length of a pedestrian.
 
     factor : metres of a step over the fourth root of the swing of the specific force (m/s^2), with its sigma;
     sideways_sigma : the same across the forward axis of the device, zero on average; step_sigma : m/sqrt(s), by which
@@ -106,7 +110,7 @@ class StepNoise:
     step_sigma: float = 0.2
 
 
-# One default a device class, the same for every recording.
+# One default per device class, the same for every recording.
 DEVICE_CLASSES: dict[str, ImuNoise] = {
     # Consumer MEMS in phones and loggers, used in motion: about five times the white noise of a device at rest, to
     # cover vibration, scale factor and misalignment.
@@ -125,9 +129,10 @@ DEVICE_CLASSES: dict[str, ImuNoise] = {
 class MagnetometerNoise:
     """Errors of a magnetometer, uT: reading = nav_R_body^T (field + disturbance) + hard iron + white, before soft iron.
 
-    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : what iron nearby adds to the Earth's field as
-    the device moves, and how long it stays alike
-    hard_iron_ut : constant offset in body axes, hard_iron_sigma_ut : how sure; that of a phone whose system calibrates
+    sigma_ut : white noise of a sample; disturbance_ut, disturbance_s : Gauss-Markov sigma and correlation
+    time (s) of what iron nearby adds to the Earth's field as the device moves
+    hard_iron_ut : constant offset in body axes, hard_iron_sigma_ut : its sigma, by default that of a phone
+    whose system calibrates
     soft_iron : row-major (3, 3), the corrected reading is soft_iron (reading - hard iron)
     """
 
@@ -136,7 +141,7 @@ class MagnetometerNoise:
     disturbance_s: float = 2.0
     hard_iron_ut: tuple[float, float, float] = (0.0, 0.0, 0.0)
     hard_iron_sigma_ut: float = 15.0
-    soft_iron: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    soft_iron: tuple[float, ...] = _IDENTITY
 
     def __post_init__(self) -> None:
         numbers = (*self.hard_iron_ut, *self.soft_iron, self.sigma_ut, self.disturbance_ut, self.disturbance_s)
@@ -146,8 +151,7 @@ class MagnetometerNoise:
             raise CalibrationError("calibration.toml", f"{self}", expected, "give uT and s")
 
 
-_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-# Largest departure of a matrix from the identity: more is a matter of axes or units, not of calibration.
+# Largest difference of a matrix from the identity; more means other axes or units, not a calibration.
 LARGEST_ERROR = 0.3
 
 
@@ -156,7 +160,7 @@ class ImuErrors:
     """Deterministic errors of the inertial sensors: true = matrix (reading - bias).
 
     accel_matrix, gyro_matrix : row-major (3, 3), scale factors and misalignments; accel_bias m/s^2, gyro_bias rad/s :
-    about which the bias states of a session stand
+    means of the bias states of a session
     """
 
     accel_matrix: tuple[float, ...] = _IDENTITY
@@ -178,7 +182,7 @@ class ImuErrors:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Device calibration as it stands in calibration.toml; `cameras` by the name that images carry."""
+    """Device calibration as in calibration.toml; `cameras` by the name that images carry."""
 
     device: str = "unknown"
     device_class: str = "mems"
@@ -192,9 +196,9 @@ class Calibration:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for room in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
-            for f in dataclasses.fields(room):
-                value = getattr(room, f.name)
+        for part in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
+            for f in dataclasses.fields(part):
+                value = getattr(part, f.name)
                 may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
                 if not (math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
                     raise CalibrationError(
@@ -205,8 +209,8 @@ class Calibration:
 _converter = cattrs.Converter(forbid_extra_keys=True)
 
 
-def from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
-    """Calibration of a parsed TOML table; missing rooms take the class default, unknown keys are refused."""
+def calibration_from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
+    """Calibration of a parsed TOML table; missing tables take the class default, unknown keys are refused."""
     filled = dict(data)
     name = filled.get("device_class", "mems")
     if name not in DEVICE_CLASSES:
@@ -220,7 +224,7 @@ def from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> C
         raise CalibrationError(where, "; ".join(cattrs.transform_error(error)), "known keys with numbers") from error
 
 
-def load(path: str | Path) -> Calibration:
+def load_calibration(path: str | Path) -> Calibration:
     """Read calibration.toml.
 
     Raises
@@ -228,9 +232,9 @@ def load(path: str | Path) -> Calibration:
     CalibrationError
         Missing or unreadable file, unknown key, or a value that is not > 0.
     """
-    return from_dict(read_toml(Path(path), CalibrationError, "a calibration.toml"), path)
+    return calibration_from_dict(read_toml(Path(path), CalibrationError, "a calibration.toml"), path)
 
 
-def dumps(calibration: Calibration) -> str:
-    """The text of calibration.toml; `from_dict` of it gives the same calibration."""
+def calibration_toml(calibration: Calibration) -> str:
+    """The text of calibration.toml; `calibration_from_dict` of it gives the same calibration."""
     return tomli_w.dumps(dataclasses.asdict(calibration))

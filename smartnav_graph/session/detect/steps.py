@@ -1,7 +1,7 @@
-"""Steps of a walker from the specific force, and how far they carry up to any time.
+"""Steps of a pedestrian from the specific force, and the length travelled up to any time.
 
-The magnitude of the specific force, low-passed and freed of its mean, swings once a step. A step ends where it rises
-again; its length in units of the step factor is Weinberg's (max - min)^(1/4). Everything known at t rests on data up to
+The magnitude of the specific force, low-passed and less its mean, swings once a step. A step ends where it rises
+again; its length in units of the step factor is Weinberg's (max - min)^(1/4). A result at t depends on data up to
 t + `LOOKAHEAD_S`.
 
 Source: Weinberg (2002), Using the ADXL202 in pedometer and personal navigation applications, AN-602.
@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import firwin
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Indices, Times, runs
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session.streams import Imu
@@ -26,8 +25,8 @@ CUTOFF_HZ = 3.0  # people make 1.4 to 2.5 steps a second
 HALF_S = 0.2  # half length of the low-pass filter
 MEAN_S = 2.0  # the mean of so many seconds before is taken off
 RISE = 0.2  # m/s^2 above the mean that ends a step, after as much below it
-LEAST_SWING = 0.75  # m/s^2 from the least to the largest: someone who writes while walking slowly swings by 1
-SHORTEST_S, LONGEST_S = 0.25, 0.75  # what comes before the longest step, or the first after a rest, was no walking
+LEAST_SWING = 0.75  # m/s^2 from the least to the largest: a slow pedestrian who writes swings by 1
+SHORTEST_S, LONGEST_S = 0.25, 0.75  # of a step: what lies longer before its end is no part of it
 LONGEST_PERIOD_S, RUN, RATIO = 1.0, 6, 0.25  # of a regular walk: seconds a step, steps in a row, change of period
 LOOKAHEAD_S = HALF_S + 1.0 / RATE_HZ + LONGEST_S
 
@@ -88,7 +87,7 @@ def _swinging(imu: Imu) -> Floats:
     return np.asarray(smooth - (total[span:-1] - total[: -span - 1]) / span)
 
 
-def _rises(force: Floats) -> NDArray[np.intp]:
+def _rises(force: Floats) -> Indices:
     """Samples where the force rises above `RISE`, each after a fall below -`RISE` and at least `SHORTEST_S` after the
     one before."""
     found: list[int] = []
@@ -104,12 +103,11 @@ def _rises(force: Floats) -> NDArray[np.intp]:
 
 
 def regular_share(steps: Steps, length_s: float) -> float:
-    """Share of `length_s` seconds spent in runs of at least `RUN` steps whose periods hardly differ: near one for a
-    device in the hand of a walker, near zero in a vehicle or on a foot."""
+    """Share of `length_s` seconds spent in runs of at least `RUN` steps of similar periods: near one for a
+    device in the hand of a pedestrian, near zero in a vehicle or on a foot."""
     period = np.diff(steps.end_ns) / NS
     usual = period <= LONGEST_PERIOD_S
-    alike = np.abs(np.diff(np.log(period))) < np.log(1.0 + RATIO) if len(period) else np.zeros(0, dtype=bool)
-    joined = np.concatenate([[False], usual[1:] & usual[:-1] & alike, [False]])
-    starts, ends = np.flatnonzero(~joined[:-1] & joined[1:]), np.flatnonzero(joined[:-1] & ~joined[1:])
-    total = sum(period[i : j + 1].sum() for i, j in zip(starts, ends, strict=True) if j - i + 2 >= RUN)
+    similar = np.abs(np.diff(np.log(period))) < np.log(1.0 + RATIO) if len(period) else np.zeros(0, dtype=bool)
+    regular = runs(usual[1:] & usual[:-1] & similar)
+    total = sum(period[i : j + 1].sum() for i, j in regular if j - i + 2 >= RUN)
     return float(total / length_s)

@@ -1,7 +1,7 @@
-"""Is a recorded session what it says? Rates, gaps, units, signs, overlaps: looked at before anything is estimated.
+"""Checks of a recorded session before anything is estimated: rates, gaps, units, signs, overlaps.
 
-Nothing is repaired here. Every rule is a small generator of findings; `RULES` is the list of them: those of any stream
-in `streams`, of the inertial stream in `inertial`, of positions in `positions`, of the other sensors in `sensors`.
+Nothing is repaired here. Every rule is a small generator of findings; `RULES` lists them: those of any stream in
+`streams`, of the inertial stream in `inertial`, of positions in `positions`, of the other sensors in `sensors`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import Gap, find_gaps, seconds_since
-from smartnav_graph.session.health import inertial, positions, sensors, streams
+from smartnav_graph.session.health import inertial, positions, sensors
+from smartnav_graph.session.health import streams as all_streams
 from smartnav_graph.session.health.facts import AIDING, Facts, Finding
 from smartnav_graph.session.health.inertial import quiet_accel, tilt_errors
 from smartnav_graph.session.session import Session
@@ -36,7 +37,7 @@ class StreamHealth:
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """What a session holds and what was noticed. Accelerations m/s^2; gaps are those of the inertial stream."""
+    """Contents and findings of a session. Accelerations m/s^2; gaps are those of the inertial stream."""
 
     streams: tuple[StreamHealth, ...]
     gaps: tuple[Gap, ...]
@@ -81,9 +82,9 @@ class Health:
 
 
 def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
-    """Look a session over; `gaps` of the inertial stream, where they are known already.
+    """The health of a session; `gaps` of the inertial stream, where they are known already.
 
-    Streams that will not be used can be left out first: ``inspect(session.replace(magnetometer=None))``.
+    Streams that will not be used can be left out: ``inspect(session.replace(magnetometer=None))``.
     """
     imu = session.imu
     usable = imu is not None and len(imu) >= 2
@@ -113,18 +114,18 @@ def _stream_health(session: Session, name: str, stream: Stream) -> StreamHealth:
 
 
 def _missing(session: Session) -> tuple[str, ...]:
-    there = session.streams()
-    out = [] if "imu" in there else ["imu"]
-    out += [] if any(name in there for name in ABSOLUTE) else [f"absolute sensor ({', '.join(ABSOLUTE)})"]
+    streams = session.streams()
+    out = [] if "imu" in streams else ["imu"]
+    out += [] if any(name in streams for name in ABSOLUTE) else [f"absolute sensor ({', '.join(ABSOLUTE)})"]
     out += ["origin"] if session.origin is None else []
     out += ["calibration"] if session.calibration is None else []
-    return (*out, *([] if "reference" in there else ["reference"]))
+    return (*out, *([] if "reference" in streams else ["reference"]))
 
 
 RULES: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
-    *streams.RULES,
+    *all_streams.RULES,
     *inertial.RULES,
     *positions.RULES,
     *sensors.RULES,
-    streams.dropped,
+    all_streams.dropped,
 )

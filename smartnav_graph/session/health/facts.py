@@ -1,4 +1,4 @@
-"""What the rules of this room share: a finding, and what several rules need of one session."""
+"""What the rules share: a finding, and quantities of one session that several rules need."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask, Times, runs
 from smartnav_graph.core.timebase import NS, Gap, interpolate
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import STREAMS, Imu
 
 AIDING = tuple(name for name, kind in STREAMS.items() if kind.AIDING)
-JUDGED = 10  # rows from which on a stream is judged
-CHORD_S = 4.0  # s, over which fixes tell a speed
+LEAST_ROWS = 10  # shorter streams are not checked
+CHORD_S = 4.0  # s between the fixes of a speed
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing noticed. level is ``error`` (cannot be estimated from), ``warning`` (looks wrong) or ``info``."""
+    """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``."""
 
     level: str
     where: str
@@ -37,7 +36,7 @@ class Chords:
     """Motion between fixes some seconds apart: stamps (n,) of their middle and velocity (n, 3) m/s, nav axes; sigma
     (n,) m/s of the horizontal velocity."""
 
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     velocity: Floats
     sigma: Floats
 
@@ -47,14 +46,14 @@ class Chords:
         return np.asarray(np.linalg.norm(self.velocity[:, :2], axis=1))
 
     @property
-    def clear(self) -> NDArray[np.bool_]:
-        """Mask (n,) of the chords that are a motion beyond noise."""
+    def clear(self) -> Mask:
+        """Mask (n,) of the chords whose motion exceeds the noise."""
         return np.asarray(self.speed > np.maximum(2.0, 4.0 * self.sigma))
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What several rules need of one session."""
+    """Quantities of one session that several rules need."""
 
     session: Session
     gaps: tuple[Gap, ...]
@@ -62,13 +61,13 @@ class Facts:
 
     @property
     def imu(self) -> Imu | None:
-        """The inertial stream when it is long enough to be judged."""
+        """The inertial stream when it is long enough to be checked."""
         imu = self.session.imu
-        return imu if imu is not None and len(imu) >= JUDGED else None
+        return imu if imu is not None and len(imu) >= LEAST_ROWS else None
 
     @cached_property
     def chords(self) -> Chords | None:
-        """Motion that the fixes tell, of GNSS or else of pose fixes; None where they are too few."""
+        """Motion between the fixes, of GNSS or else of pose fixes; None where they are too few."""
         stream = self.session.gnss if self.session.gnss is not None else self.session.pose_fixes
         if stream is None or len(stream) < 3:
             return None
@@ -86,13 +85,13 @@ class Facts:
 
 
 def fix_sigma(stream: Positioned) -> Floats:
-    """Horizontal sigma (n,) m of fixes, 5 m where none is told."""
+    """Horizontal sigma (n,) m of fixes, 5 m where none is given."""
     if stream.sigma is None:
         return np.full(len(stream), 5.0)
     return np.asarray(np.linalg.norm(np.nan_to_num(stream.sigma[:, :2], nan=5.0), axis=1))
 
 
-def over_chords(chords: Chords, t_ns: NDArray[np.int64], values: Floats) -> Floats:
+def over_chords(chords: Chords, t_ns: Times, values: Floats) -> Floats:
     """Means of a sampled signal (n,) or (n, k) over the time of each chord, by its integral."""
     dt = np.diff(t_ns, prepend=t_ns[0])[:, None] / NS
     rows = values.reshape(len(t_ns), -1)
@@ -107,9 +106,7 @@ def over_chords(chords: Chords, t_ns: NDArray[np.int64], values: Floats) -> Floa
 def repeats(values: Floats) -> list[tuple[int, int]]:
     """First and last row of every stretch in which a signal (n,) or (n, k) repeats itself exactly."""
     rows = values.reshape(len(values), -1)
-    same = np.concatenate([[False], (rows[1:] == rows[:-1]).all(axis=1), [False]])
-    first, last = np.flatnonzero(~same[:-1] & same[1:]), np.flatnonzero(same[:-1] & ~same[1:])
-    return [(int(i), int(j)) for i, j in zip(first, last, strict=True)]
+    return [(int(i), int(j)) for i, j in runs((rows[1:] == rows[:-1]).all(axis=1))]
 
 
 def count_of(n: int, noun: str, plural: str = "s") -> str:
@@ -122,7 +119,7 @@ def period(imu: Imu) -> float:
     return float(np.median(np.diff(imu.t_ns))) / NS
 
 
-def thinned(imu: Imu) -> Imu:
-    """Every n-th row, to 50 Hz: enough to see a step or a turn."""
+def decimated(imu: Imu) -> Imu:
+    """Every n-th row, to 50 Hz: enough for steps and turns."""
     every = max(1, round(0.02 / period(imu)))
     return imu.take(slice(None, None, every)) if every > 1 else imu

@@ -1,35 +1,34 @@
-"""The inertial stream: units and signs of both triads, rest, holes, and readings that stand still."""
+"""The inertial stream: units and signs of both triads, gravity at rest, data gaps, frozen and clipped readings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import frames
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices, Mask, Times
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.session.health.facts import (
     CHORD_S,
-    JUDGED,
+    LEAST_ROWS,
     Facts,
     Finding,
     count_of,
+    decimated,
     over_chords,
     period,
     repeats,
-    thinned,
 )
 from smartnav_graph.session.streams import Imu
 
 _MAX_RATE = 35.0  # rad/s = 2000 deg/s, where consumer gyroscopes saturate
 _MAX_RMS_RATE = 10.0  # rad/s; a phone shaken by hand reaches 5
-_FROZEN_S = 1.0  # six axes never repeat themselves for so long
+_FROZEN_S = 1.0  # six axes never repeat for so long
 _CLEAR_TURN = 0.4  # rad in some seconds
-_ALIKE = 0.7  # correlation that is no chance
+_CORRELATED = 0.7  # correlation beyond chance
 
 
 def quiet_accel(imu: Imu) -> float | None:
@@ -38,7 +37,7 @@ def quiet_accel(imu: Imu) -> float | None:
     Quiet: on every axis accel varies by less than 0.4 m/s^2 and gyro by less than 0.05 rad/s (standard deviations),
     several times the noise of a phone at rest and less than any step or engine under load.
     """
-    imu = thinned(imu)
+    imu = decimated(imu)
     if len(imu) < 6:
         return None
     width = max(3, round(0.5 / period(imu)))
@@ -55,12 +54,11 @@ def quiet_accel(imu: Imu) -> float | None:
 
 
 def _gaps(facts: Facts) -> Iterator[Finding]:
-    told = {"missing": "without samples", "bridged": "filled by straight lines"}
-    for kind, what in told.items():
+    for kind, what in (("missing", "without samples"), ("bridged", "linearly interpolated")):
         gaps = [gap for gap in facts.gaps if gap.kind == kind]
         if gaps:
             total, longest = sum(gap.length_s for gap in gaps), max(gaps, key=lambda gap: gap.length_s)
-            at, count = float(facts.session.seconds(longest.start_ns)), count_of(len(gaps), "stretch", "es")
+            at, count = float(facts.session.seconds(longest.start_ns)), count_of(len(gaps), "data gap")
             text = f"{count} {what}, {total:.2f} s in all, longest {longest.length_s:.2f} s at {at:.2f} s"
             yield Finding("warning", "imu", text, "the uncertainty grows there; fixes around them help")
 
@@ -69,15 +67,15 @@ def _accel_unit(facts: Facts) -> Iterator[Finding]:
     if facts.imu is None:
         return
     median = float(np.median(np.linalg.norm(facts.imu.accel, axis=1)))
-    g, said = facts.session.gravity, f"median |accel| {median:.3g} m/s^2, expected about {facts.session.gravity:.4g}"
+    g, found = facts.session.gravity, f"median |accel| {median:.3g} m/s^2, expected about {facts.session.gravity:.4g}"
     if abs(median - 1.0) < 0.2:
-        yield Finding("warning", "imu", f"{said}: it looks like units of g", "multiply accel by 9.80665")
+        yield Finding("warning", "imu", f"{found}: it looks like units of g", "multiply accel by 9.80665")
     elif abs(median - g * g) < 0.2 * g * g:
-        yield Finding("warning", "imu", f"{said}: it looks scaled by 9.81 once too often", "divide accel by 9.80665")
+        yield Finding("warning", "imu", f"{found}: it looks scaled by 9.81 twice", "divide accel by 9.80665")
     elif median < 0.5 * g:
-        yield Finding("warning", "imu", f"{said}: gravity seems removed", "import specific force, gravity included")
+        yield Finding("warning", "imu", f"{found}: gravity seems removed", "import specific force, gravity included")
     elif median > 2.0 * g:
-        yield Finding("warning", "imu", f"{said}: {median / g:.3g} times too large", "import accel in m/s^2")
+        yield Finding("warning", "imu", f"{found}: {median / g:.3g} times too large", "import accel in m/s^2")
     elif facts.quiet_accel is not None and abs(facts.quiet_accel - g) > 0.1 * g:
         text = f"|accel| at rest {facts.quiet_accel:.3f} m/s^2, {100 * (facts.quiet_accel / g - 1):+.1f} % off gravity"
         yield Finding("warning", "imu", text, "calibrate the accelerometer, or check gravity_m_s2 of the session")
@@ -117,7 +115,7 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
 
 
 def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
-    """How far gravity turned by the gyro ends from the accelerometer's, for three units and the other sign.
+    """How far gravity turned by the gyro ends from the accelerometer's, for three units and the opposite sign.
 
     For windows at whose ends |accel| is near its median, the up direction a_0 (body axes) is carried through the
     window, a_1 = (prod Exp(s omega dt))^T a_0, with s = 1, pi/180, 180/pi and -1. With the right unit the angle to the
@@ -128,7 +126,7 @@ def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[
     -------
     Median angle in degrees by s; None when fewer than ten windows qualify.
     """
-    imu = thinned(imu)
+    imu = decimated(imu)
     step = period(imu)
     n = round(window_s / step)
     if n < 8 or len(imu) < 2 * n:
@@ -146,7 +144,7 @@ def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[
     return {s: _median_angle_deg(imu, start, n, s, up_0, up_1) for s in (1.0, np.pi / 180, 180 / np.pi, -1.0)}
 
 
-def _median_angle_deg(imu: Imu, start: NDArray[np.intp], n: int, s: float, up_0: Floats, up_1: Floats) -> float:
+def _median_angle_deg(imu: Imu, start: Indices, n: int, s: float, up_0: Floats, up_1: Floats) -> float:
     turn = Rotation.identity(len(start))
     for row in (start + i for i in range(n)):
         dt = (imu.t_ns[row + 1] - imu.t_ns[row])[:, None] / NS
@@ -161,21 +159,21 @@ def _gyro_course(facts: Facts) -> Iterator[Finding]:
     if turns is None:
         return
     course, gyro = turns
-    alike, slope = _fit(course, gyro, np.abs(gyro) > _CLEAR_TURN)
-    if alike < -_ALIKE and 0.5 < -slope < 2.0:
+    correlation, slope = _fit(course, gyro, np.abs(gyro) > _CLEAR_TURN)
+    if correlation < -_CORRELATED and 0.5 < -slope < 2.0:
         text = "gyro turns against the course of the fixes: its sign is wrong, or the fixes are mirrored"
         yield Finding("warning", "imu", text, "flip the sign of gyro, or exchange latitude and longitude of the fixes")
-    alike, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
-    if alike > _ALIKE and 30.0 < slope < 90.0:
+    correlation, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
+    if correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the fixes turn {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
         yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
 
 
-def _fit(course: Floats, gyro: Floats, clear: NDArray[np.bool_]) -> tuple[float, float]:
+def _fit(course: Floats, gyro: Floats, clear: Mask) -> tuple[float, float]:
     """Correlation of the clear turns, and how many times the course turns as fast; zeros where they are few."""
     c, g = course[clear], gyro[clear]
     power = float(g @ g)
-    if len(c) < JUDGED or not power > 0:
+    if len(c) < LEAST_ROWS or not power > 0:
         return 0.0, 0.0
     return float(c @ g) / float(np.sqrt(power * (c @ c))), float(c @ g) / power
 
@@ -183,7 +181,7 @@ def _fit(course: Floats, gyro: Floats, clear: NDArray[np.bool_]) -> tuple[float,
 def _turns(facts: Facts) -> tuple[Floats, Floats] | None:
     """Turn (m,) rad of the course over some seconds, and of the gyro about the vertical; None without clear turns."""
     imu, chords = facts.imu, facts.chords
-    if imu is None or chords is None or chords.clear.sum() < JUDGED:
+    if imu is None or chords is None or chords.clear.sum() < LEAST_ROWS:
         return None
     up = over_chords(chords, imu.t_ns, imu.accel)
     rate = over_chords(chords, imu.t_ns, imu.gyro)
@@ -198,7 +196,7 @@ def _turns(facts: Facts) -> tuple[Floats, Floats] | None:
 
 
 def _frozen(facts: Facts) -> Iterator[Finding]:
-    """Stretches in which all six axes repeat the last row, and axes that never move."""
+    """Stretches in which all six axes repeat one row, and axes that never change."""
     imu = facts.imu
     if imu is None:
         return
@@ -208,28 +206,28 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
         triad = imu.gyro if name.startswith("gyro") else imu.accel
         if (column == column[0]).all() and not (triad == triad[0]).all():
             yield Finding("warning", "imu", f"{name} is {column[0]:g} in all {len(imu)} rows", "import the log again")
-    runs = [run for run in repeats(signal) if (imu.t_ns[run[1]] - imu.t_ns[run[0]]) / NS > _FROZEN_S]
-    if runs and runs[0] != (0, len(imu) - 1):
-        at, seconds = float(facts.session.seconds(imu.t_ns[runs[0][0]])), _length(imu.t_ns, runs)
-        where = f"{count_of(len(runs), 'stretch', 'es')}, first at {at:.1f} s"
+    frozen = [run for run in repeats(signal) if (imu.t_ns[run[1]] - imu.t_ns[run[0]]) / NS > _FROZEN_S]
+    if frozen and frozen[0] != (0, len(imu) - 1):
+        at, seconds = float(facts.session.seconds(imu.t_ns[frozen[0][0]])), _length(imu.t_ns, frozen)
+        where = f"{count_of(len(frozen), 'stretch', 'es')}, first at {at:.1f} s"
         text = f"repeats one row of readings for {seconds:.1f} s in {where}"
-        yield Finding("warning", "imu", text, "the sensor hung there; cut the rows out so that they count as a gap")
+        yield Finding("warning", "imu", text, "sensor output frozen; remove the rows so that they count as a gap")
 
 
-def _length(t_ns: NDArray[np.int64], runs: list[tuple[int, int]]) -> float:
+def _length(t_ns: Times, runs: list[tuple[int, int]]) -> float:
     return sum(float(t_ns[last] - t_ns[first]) for first, last in runs) / NS
 
 
 def _clipped(facts: Facts) -> Iterator[Finding]:
-    """Readings that stand at the largest value again and again: the end of the range."""
+    """Readings that repeat the largest value: the end of the range."""
     if facts.imu is None:
         return
     for name, values, least in (("accel", facts.imu.accel, 1.5 * facts.session.gravity), ("gyro", facts.imu.gyro, 4.0)):
         size = np.abs(values).max(axis=1)
         top = float(size.max())
         at_top = size >= top * (1 - 1e-6)
-        if top > least and at_top.sum() >= JUDGED and (at_top[1:] & at_top[:-1]).sum() >= JUDGED // 2:
-            text = f"|{name}| stands at {top:.4g} in {int(at_top.sum())} rows: the end of its range"
+        if top > least and at_top.sum() >= LEAST_ROWS and (at_top[1:] & at_top[:-1]).sum() >= LEAST_ROWS // 2:
+            text = f"|{name}| is {top:.4g} in {int(at_top.sum())} rows: the end of its range"
             yield Finding("warning", "imu", text, "choose a larger range when recording; the motion there is lost")
 
 

@@ -1,16 +1,15 @@
-"""Positions: jumps, exchanged or wrong units, the zero of heights, and the speeds and attitudes that come with them."""
+"""Positions: jumps, exchanged axes, wrong units, the zero of heights, and the velocities and attitudes of fixes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.session.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats, thinned
+from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, decimated, over_chords, repeats
 from smartnav_graph.session.health.units import odd_speed
 from smartnav_graph.session.stream import Positioned
 
@@ -28,7 +27,7 @@ def _jumps(facts: Facts) -> Iterator[Finding]:
         if stream is None or len(stream) < 2:
             continue
         position = facts.session.nav_position(stream)
-        # a jump must stand out of the noise of both fixes, or 10 Hz fixes would always jump
+        # a jump must exceed the noise of both fixes, or 10 Hz fixes would always jump
         sigma = np.linalg.norm(np.nan_to_num(stream.sigma, nan=5.0), axis=1) if stream.sigma is not None else 5.0
         noise = 4.0 * np.broadcast_to(sigma, len(position))
         allowed = _MAX_FIX_SPEED * np.diff(stream.t_ns) / NS + np.hypot(noise[1:], noise[:-1])
@@ -49,7 +48,7 @@ def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
             text = f"{bad} of {len(stream)} rows have no sigma"
             yield Finding("info", name, text, "the default of the device class will be used there")
         if facts.session.mount(name).frame == "msl":
-            yield Finding("info", name, "heights count from mean sea level, not from the ellipsoid")
+            yield Finding("info", name, "heights are above mean sea level, not above the ellipsoid")
 
 
 def _exchanged(facts: Facts) -> Iterator[Finding]:
@@ -76,12 +75,12 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
 
 
 def _geodetic(facts: Facts) -> dict[str, Floats]:
-    """Latitude and longitude (deg) and height (n, 3) m of the streams that tell them."""
+    """Latitude and longitude (deg) and height (n, 3) m of the geodetic streams."""
     return {name: s.lla for name, s in facts.session.positions().items() if len(s) and s.lla is not None}
 
 
 def _degrees_apart(one: Floats, other: Floats) -> float:
-    """Angle between two (lat, lon) in degrees, good enough to tell kilometres from thousands of them."""
+    """Angle between two (lat, lon) in degrees, good enough to separate kilometres from thousands of them."""
     if abs(one[0]) > 90.0:
         return 180.0
     lon = (one[1] - other[1] + 180.0) % 360.0 - 180.0
@@ -91,7 +90,7 @@ def _degrees_apart(one: Floats, other: Floats) -> float:
 def _heights(facts: Facts) -> Iterator[Finding]:
     for name, lla in _geodetic(facts).items():
         height = lla[:, 2]
-        if len(height) >= JUDGED and not height.any():
+        if len(height) >= LEAST_ROWS and not height.any():
             yield Finding(
                 "warning", name, "height_m is zero in all rows", "the log holds no heights; give large sigma_u_m"
             )
@@ -111,7 +110,7 @@ def _heights(facts: Facts) -> Iterator[Finding]:
     if _GEOID_M[0] < abs(middle) < _GEOID_M[1] and abs(middle) > 4.0 * spread and len(frames) == 1:
         text = f"heights lie {middle:+.1f} m off those of the control points, as the geoid does"
         yield Finding(
-            "warning", "gnss", text, 'one of them counts from sea level: say so by frame = "msl" in [sensors]'
+            "warning", "gnss", text, 'one of them is above sea level: declare it by frame = "msl" in [sensors]'
         )
 
 
@@ -119,24 +118,24 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
     """A fix repeated while the device moves."""
     for name in ("gnss", "pose_fixes"):
         stream = getattr(facts.session, name)
-        if stream is None or facts.imu is None or len(stream) < JUDGED:
+        if stream is None or facts.imu is None or len(stream) < LEAST_ROWS:
             continue
         position = facts.session.nav_position(stream)
         for first, last in repeats(position):
-            seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS
-            if last - first >= JUDGED // 2 and seconds >= _FROZEN_FIXES_S and _moves(facts, stream.t_ns[[first, last]]):
+            seconds, rows = (stream.t_ns[last] - stream.t_ns[first]) / NS, last - first
+            frozen = seconds >= _FROZEN_FIXES_S and LEAST_ROWS // 2 <= rows < len(stream) - 1
+            if frozen and _moves(facts, stream.t_ns[[first, last]]):
                 at = float(facts.session.seconds(stream.t_ns[first]))
                 text = f"repeats one position for {seconds:.0f} s from {at:.1f} s on, while the inertial data move"
-                if last - first < len(stream) - 1:
-                    yield Finding("warning", name, text, "the receiver hung there; take the repeated rows out")
+                yield Finding("warning", name, text, "receiver output frozen; remove the repeated rows")
 
 
-def _moves(facts: Facts, span: NDArray[np.int64]) -> bool:
-    """Whether rate or force of a stretch scatter more than at rest."""
+def _moves(facts: Facts, span: Times) -> bool:
+    """Whether rate or force in a time span scatter more than at rest."""
     imu = facts.imu
     assert imu is not None
     inside = (imu.t_ns >= span[0]) & (imu.t_ns <= span[1])
-    if inside.sum() < JUDGED:
+    if inside.sum() < LEAST_ROWS:
         return False
     return bool(imu.gyro[inside].std(axis=0).max() > 0.05 or imu.accel[inside].std(axis=0).max() > 0.4)
 
@@ -147,14 +146,14 @@ def _velocities(facts: Facts) -> Iterator[Finding]:
     if gnss is None or gnss.velocity is None or chords is None:
         return
     known = np.isfinite(gnss.velocity).all(axis=1)
-    if known.sum() < JUDGED or chords.clear.sum() < JUDGED:
+    if known.sum() < LEAST_ROWS or chords.clear.sum() < LEAST_ROWS:
         return
-    told = over_chords(chords, gnss.t_ns[known], gnss.velocity[known])[chords.clear]
-    moved = chords.velocity[chords.clear]
-    yield from odd_speed("gnss", "velocity", np.linalg.norm(told[:, :2], axis=1), chords.speed[chords.clear])
-    length = np.linalg.norm(told[:, :2], axis=1) * np.linalg.norm(moved[:, :2], axis=1)
-    along = float(np.median((told[:, :2] * moved[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
-    turned = float(np.median((told[:, [1, 0]] * moved[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
+    measured = over_chords(chords, gnss.t_ns[known], gnss.velocity[known])[chords.clear]
+    motion = chords.velocity[chords.clear]
+    yield from odd_speed("gnss", "velocity", np.linalg.norm(measured[:, :2], axis=1), chords.speed[chords.clear])
+    length = np.linalg.norm(measured[:, :2], axis=1) * np.linalg.norm(motion[:, :2], axis=1)
+    along = float(np.median((measured[:, :2] * motion[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
+    turned = float(np.median((measured[:, [1, 0]] * motion[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
     if along < -0.7:
         yield Finding("warning", "gnss", "velocity points against the motion of the fixes", "flip its sign")
     elif turned > 0.9 and along < 0.7:
@@ -173,10 +172,10 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
     if len(pairs) < _LEAST_PAIRS:
         return
     pairs = pairs[np.linspace(0, len(pairs) - 1, min(_ATTITUDE_PAIRS, len(pairs))).astype(int)]
-    slow = thinned(imu)
+    slow = decimated(imu)
     turned = [_turn(slow.t_ns, slow.gyro, t_ns[k], t_ns[k + 1]) for k in pairs]
     readings = {
-        "as they stand": quat[:, [1, 2, 3, 0]],
+        "unchanged": quat[:, [1, 2, 3, 0]],
         "with qw last": quat,
         "inverted": quat[:, [1, 2, 3, 0]] * [-1, -1, -1, 1],
     }
@@ -186,18 +185,18 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
         differs = (R[pairs].inv() * R[pairs + 1]).inv() * Rotation.concatenate(turned)
         off[name] = float(np.degrees(np.quantile(differs.magnitude(), 0.75)))
     best = min(off, key=lambda name: off[name])
-    if best != "as they stand" and off["as they stand"] > 20.0 and off[best] < 0.25 * off["as they stand"]:
-        text = f"attitudes turn {off['as they stand']:.0f} deg otherwise than gyro, {off[best]:.1f} deg if read {best}"
+    if best != "unchanged" and off["unchanged"] > 20.0 and off[best] < 0.25 * off["unchanged"]:
+        text = f"attitudes turn {off['unchanged']:.0f} deg away from gyro, {off[best]:.1f} deg if read {best}"
         yield Finding("warning", "pose_fixes", text, "give qw, qx, qy, qz of nav_R_body")
         return
     up = interpolate(t_ns, slow.t_ns, slow.accel)
-    vertical = float(np.median(Rotation.from_quat(readings["as they stand"]).apply(up)[:, 2]))
+    vertical = float(np.median(Rotation.from_quat(readings["unchanged"]).apply(up)[:, 2]))
     if vertical < -0.5 * facts.session.gravity:
         text = f"attitudes turn specific force to {vertical:.1f} m/s^2 along up: they look like north, east, down"
         yield Finding("warning", "pose_fixes", text, "give nav_R_body with nav = east, north, up")
 
 
-def _turn(t_ns: NDArray[np.int64], gyro: Floats, begin: int, end: int) -> Rotation:
+def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:
     """Rotation of the body from `begin` to `end` by its rates."""
     inside = t_ns[(t_ns > begin) & (t_ns < end)]
     edges = np.concatenate([[begin], inside, [end]])

@@ -1,18 +1,17 @@
-"""Magnetometer, barometer, thermometer, speeds of the body, standstills: units, signs, what cannot be."""
+"""Magnetometer, barometer, thermometer, speeds of the body, standstills: units, signs, impossible values."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import frames
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.so3 import exp, rotate
 from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.session.health.facts import JUDGED, Facts, Finding, count_of, over_chords, repeats
+from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, over_chords, repeats
 from smartnav_graph.session.health.units import odd_speed
 
 _EARTH_UT = (22.0, 67.0)  # of the geomagnetic field at the ground
@@ -22,13 +21,13 @@ _PRESSURE_HPA = (300.0, 1100.0)
 _WEATHER = 0.06  # share of the pressure
 _MAX_SPEED = 100.0  # m/s
 _FROZEN_FIELD_S = 10.0
-_ALIKE = 0.4  # correlation that is no chance
-_TURNS = 0.3  # rad/s, scatter of the rate of a device that is no rest
+_CORRELATED = 0.4  # correlation beyond chance
+_TURNS = 0.3  # rad/s, scatter of the rate of a device in motion
 
 
 def _field(facts: Facts) -> Iterator[Finding]:
     stream = facts.session.magnetometer
-    if stream is None or len(stream) < JUDGED or (stream.field_ut == stream.field_ut[0]).all():
+    if stream is None or len(stream) < LEAST_ROWS or (stream.field_ut == stream.field_ut[0]).all():
         return
     size = float(np.median(np.linalg.norm(stream.field_ut, axis=1)))
     expected = facts.session.magnetic_field_ut
@@ -49,10 +48,13 @@ def _field(facts: Facts) -> Iterator[Finding]:
     yield from _field_direction(facts, size)
     for first, last in repeats(stream.field_ut):
         seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS
-        if seconds >= _FROZEN_FIELD_S and last - first >= JUDGED:
+        if seconds >= _FROZEN_FIELD_S and last - first >= LEAST_ROWS:
             at = float(facts.session.seconds(stream.t_ns[first]))
             yield Finding(
-                "warning", "magnetometer", f"repeats one reading for {seconds:.0f} s from {at:.1f} s on", "it hung"
+                "warning",
+                "magnetometer",
+                f"repeats one reading for {seconds:.0f} s from {at:.1f} s on",
+                "sensor output frozen",
             )
             return
 
@@ -64,48 +66,48 @@ def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
         return
     inside = (stream.t_ns >= imu.t_ns[0]) & (stream.t_ns <= imu.t_ns[-1])
     field, t_ns = stream.field_ut[inside], stream.t_ns[inside]
-    if len(field) < JUDGED:
+    if len(field) < LEAST_ROWS:
         return
     up = interpolate(t_ns, imu.t_ns, imu.accel)
     sine = np.median((field * up).sum(axis=1) / np.linalg.norm(field, axis=1) / np.linalg.norm(up, axis=1))
     if expected is not None and abs(size / np.linalg.norm(expected) - 1.0) < 0.3:
         wanted = float(expected[2] / np.linalg.norm(expected))
         if abs(wanted) > 0.5 and abs(sine + wanted) < 0.2:
-            found, there = np.degrees(np.arcsin(sine)), np.degrees(np.arcsin(wanted))
-            text = f"field points {found:+.0f} deg from the horizon, expected {there:+.0f}"
+            found, dip = np.degrees(np.arcsin(sine)), np.degrees(np.arcsin(wanted))
+            text = f"field points {found:+.0f} deg from the horizon, expected {dip:+.0f}"
             yield Finding("warning", "magnetometer", f"{text}: its sign is wrong", "flip the sign of all axes")
             return
     yield from _field_turns(facts, t_ns, field)
 
 
-def _field_turns(facts: Facts, t_ns: NDArray[np.int64], field: Floats) -> Iterator[Finding]:
-    """Changes of the field over a second against those that gyro foretells, B(t + dt) = Exp(-w dt) B(t)."""
+def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
+    """Changes of the field over a second against those predicted from gyro, B(t + dt) = Exp(-w dt) B(t)."""
     imu = facts.imu
     assert imu is not None
     every = max(1, round(NS / float(np.median(np.diff(t_ns)))))
     field, t_ns = uniform_filter1d(field, every, axis=0)[::every], t_ns[::every]
     length = (t_ns[1:] - t_ns[:-1]) / NS
     whole = length < 2.0
-    if whole.sum() < JUDGED:
+    if whole.sum() < LEAST_ROWS:
         return
     angle = np.cumsum(imu.gyro * np.diff(imu.t_ns, prepend=imu.t_ns[0])[:, None] / NS, axis=0)
     turn = np.diff(interpolate(t_ns, imu.t_ns, angle), axis=0)[whole]
     change = np.diff(field, axis=0)[whole]
-    foretold = Rotation.from_rotvec(-turn).apply(field[:-1][whole]) - field[:-1][whole]
-    power = float((foretold**2).sum())
-    slope = float((change * foretold).sum()) / max(power, 1e-12)
-    alike = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
-    if alike < -_ALIKE:
-        text = "field turns against gyro: its axes are mirrored or exchanged, or gyro has the wrong sign"
+    predicted = rotate(exp(-turn), field[:-1][whole]) - field[:-1][whole]
+    power = float((predicted**2).sum())
+    slope = float((change * predicted).sum()) / max(power, 1e-12)
+    correlation = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
+    if correlation < -_CORRELATED:
+        text = "field turns against gyro: its axes are mirrored or exchanged, or the sign of gyro is wrong"
         yield Finding("warning", "magnetometer", text, "give the field in body axes, right-handed")
-    elif alike > _ALIKE and 30.0 < slope < 90.0:
+    elif correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
         yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
 
 
 def _pressure(facts: Facts) -> Iterator[Finding]:
     stream = facts.session.barometer
-    if stream is None or len(stream) < JUDGED:
+    if stream is None or len(stream) < LEAST_ROWS:
         return
     median, low, high = float(np.median(stream.pressure_hpa)), *_PRESSURE_HPA
     height = facts.session.origin.height_m if facts.session.origin is not None else None
@@ -137,21 +139,19 @@ def _speeds(facts: Facts) -> Iterator[Finding]:
     forward = frames.axis_vector(facts.session.device.forward)
     wheel, velocity = facts.session.wheel, facts.session.velocity
     rolls = facts.session.device.vehicle in ("car", "trolley")
-    if wheel is not None and len(wheel) >= JUDGED:
+    if wheel is not None and len(wheel) >= LEAST_ROWS:
         yield from _speed(facts, "wheel", "speed", wheel.t_ns, wheel.speed, wheel.speed)
-    if velocity is not None and len(velocity) >= JUDGED:
+    if velocity is not None and len(velocity) >= LEAST_ROWS:
         along = velocity.velocity @ forward
         size = np.linalg.norm(velocity.velocity, axis=1)
         yield from _speed(facts, "velocity", "velocity", velocity.t_ns, size, along if rolls else size)
 
 
-def _speed(
-    facts: Facts, where: str, what: str, t_ns: NDArray[np.int64], size: Floats, along: Floats
-) -> Iterator[Finding]:
+def _speed(facts: Facts, where: str, what: str, t_ns: Times, size: Floats, along: Floats) -> Iterator[Finding]:
     chords = facts.chords
     fastest = float(np.quantile(np.abs(size), 0.99))
     inside = None if chords is None else chords.clear & (chords.t_ns >= t_ns[0]) & (chords.t_ns <= t_ns[-1])
-    if chords is None or inside is None or inside.sum() < JUDGED:
+    if chords is None or inside is None or inside.sum() < LEAST_ROWS:
         if fastest > _MAX_SPEED:
             yield Finding(
                 "warning", where, f"99 % quantile of {what} is {fastest:.4g} m/s, faster than any car", "give m/s"
@@ -176,7 +176,7 @@ def _standstills(facts: Facts) -> Iterator[Finding]:
     moving = 0
     for begin, end in zip(stream.t_ns, stream.t_end_ns, strict=True):
         inside = (imu.t_ns >= begin) & (imu.t_ns <= end)
-        turned = inside.sum() >= JUDGED and float(imu.gyro[inside].std(axis=0).max()) > _TURNS
+        turned = inside.sum() >= LEAST_ROWS and float(imu.gyro[inside].std(axis=0).max()) > _TURNS
         within = (
             np.zeros(0, dtype=bool) if chords is None else (chords.t_ns > begin + 2 * NS) & (chords.t_ns < end - 2 * NS)
         )

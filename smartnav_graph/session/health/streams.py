@@ -1,4 +1,4 @@
-"""Any stream: rows, clock, overlap with the inertial stream, values that never change."""
+"""Every stream: rows, clock, overlap with the inertial stream, values that never change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session.health.facts import AIDING, JUDGED, Facts, Finding, period
+from smartnav_graph.session.health.facts import AIDING, LEAST_ROWS, Facts, Finding, period
 from smartnav_graph.session.streams import ABSOLUTE, StaticPeriod
 
 _UNIX_FROM, _UNIX_TO = 631_152_000 * NS, 4_102_444_800 * NS  # 1990 to 2100
@@ -20,7 +20,7 @@ def _rows(facts: Facts) -> Iterator[Finding]:
         if not len(stream):
             yield Finding("error", name, "has no rows", "remove the stream, or import the log again")
     if session.imu is None:
-        yield Finding("error", "imu", "there is no inertial stream", "import one; everything else hangs on it")
+        yield Finding("error", "imu", "there is no inertial stream", "the IMU is required; import one")
     elif 0 < len(session.imu) < 2:
         yield Finding("error", "imu", "has one row only", "import at least two")
     elif len(session.imu) and (length := (session.imu.t_ns[-1] - session.imu.t_ns[0]) / NS) < 1.0:
@@ -47,7 +47,7 @@ def _clock(facts: Facts) -> Iterator[Finding]:
 
 def _constant(facts: Facts) -> Iterator[Finding]:
     s = facts.session
-    # a phone at rest may repeat one fix, and pressure is quantised: possible, but worth a word
+    # a phone at rest may repeat one fix, and pressure is quantised: possible, therefore a warning only
     columns: list[tuple[str, str, str, Floats | None]] = [
         ("error", "imu", "gyro", s.imu.gyro if s.imu else None),
         ("error", "imu", "accel", s.imu.accel if s.imu else None),
@@ -60,7 +60,12 @@ def _constant(facts: Facts) -> Iterator[Finding]:
         ("warning", "temperature", "temperature", s.temperature.temperature_c if s.temperature else None),
     ]
     for level, stream, what, values in columns:
-        if values is not None and len(values) >= JUDGED and (values == values[0]).all() and not _resting(facts, stream):
+        if (
+            values is not None
+            and len(values) >= LEAST_ROWS
+            and (values == values[0]).all()
+            and not _resting(facts, stream)
+        ):
             text = f"{what} is {' '.join(f'{x:g}' for x in np.atleast_1d(values[0]))} in all {len(values)} rows"
             yield Finding(level, stream, text, f"if the sensor did not record, remove {stream} or import it again")
 

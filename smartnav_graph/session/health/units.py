@@ -1,4 +1,4 @@
-"""Speeds in another unit, told from a speed that is known."""
+"""Speeds in a wrong unit, found by comparison with a known speed."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.session.health.facts import JUDGED, Finding
+from smartnav_graph.session.health.facts import LEAST_ROWS, Finding
 
 _SPEEDS = {3.6: "km/h", 1.944: "knots", 2.237: "mph", 3.281: "ft/s", 100.0: "cm/s", 1000.0: "mm/s"}
 _NEAR = 0.06  # of a unit's factor
-_ODD = 1.3  # a factor that no slip or tyre explains
+_ODD = 1.3  # a factor that slip or tyres do not explain
 
 
-def odd_speed(where: str, what: str, told: Floats, known: Floats) -> Iterator[Finding]:
-    """Speeds (n,) told by a sensor against those known from elsewhere (n,) m/s."""
-    if len(told) < JUDGED:
+def odd_speed(where: str, what: str, measured: Floats, known: Floats) -> Iterator[Finding]:
+    """Speeds (n,) of a sensor against those known from elsewhere (n,) m/s."""
+    if len(measured) < LEAST_ROWS:
         return
-    factor = float(np.median(told / known))
-    scatter = float(np.median(np.abs(told / known - factor)))
+    factor = float(np.median(measured / known))
+    scatter = float(np.median(np.abs(measured / known - factor)))
     if 1.0 / _ODD < factor < _ODD or scatter > 0.3 * abs(factor):
         return
     unit = next((name for f, name in _SPEEDS.items() if abs(factor / f - 1.0) < _NEAR), None)

@@ -70,7 +70,7 @@ def test_the_errors_are_taken_out_once(clean):
 
 def test_text_and_back():
     one = Calibration(imu_errors=ERRORS)
-    assert model.from_dict(tomllib.loads(model.dumps(one))) == one
+    assert model.calibration_from_dict(tomllib.loads(model.calibration_toml(one))) == one
 
 
 @pytest.mark.parametrize(

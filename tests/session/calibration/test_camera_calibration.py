@@ -72,8 +72,8 @@ def test_a_camera_that_cannot_be_is_refused(changes, text):
 def test_cameras_live_in_the_calibration_file(tmp_path):
     made = model.Calibration(cameras={"cam0": EUROC, "wide": FISHEYE})
     path = tmp_path / "calibration.toml"
-    path.write_text(model.dumps(made))
-    assert model.load(path) == made
-    path.write_text(model.dumps(made).replace("fy = 457.296", "fyy = 457.296"))
+    path.write_text(model.calibration_toml(made))
+    assert model.load_calibration(path) == made
+    path.write_text(model.calibration_toml(made).replace("fy = 457.296", "fyy = 457.296"))
     with pytest.raises(CalibrationError, match="fyy"):
-        model.load(path)
+        model.load_calibration(path)

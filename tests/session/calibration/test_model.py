@@ -15,12 +15,14 @@ from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration
 def test_text_and_back_is_the_same_calibration():
     noise = dataclasses.replace(DEVICE_CLASSES["mems"], gyro_bias_walk=1.2345678901234567e-7)
     one = Calibration('Phone "7"', "mems", noise, GnssNoise(1.5, 2.25))
-    assert model.from_dict(tomllib.loads(model.dumps(one))) == one
-    assert model.from_dict({}) == Calibration()
+    assert model.calibration_from_dict(tomllib.loads(model.calibration_toml(one))) == one
+    assert model.calibration_from_dict({}) == Calibration()
 
 
 def test_what_is_left_out_is_the_default_of_the_class():
-    found = model.from_dict({"imu_noise": {"accel_noise_density": 0.1}, "gnss_noise": {"vertical_sigma": 9.0}})
+    found = model.calibration_from_dict(
+        {"imu_noise": {"accel_noise_density": 0.1}, "gnss_noise": {"vertical_sigma": 9.0}}
+    )
     assert found.imu_noise == dataclasses.replace(DEVICE_CLASSES["mems"], accel_noise_density=0.1)
     assert found.gnss_noise == GnssNoise(vertical_sigma=9.0)
 
@@ -43,7 +45,7 @@ def test_what_is_left_out_is_the_default_of_the_class():
 )
 def test_faults_name_file_key_and_value(data, parts):
     with pytest.raises(CalibrationError) as e:
-        model.from_dict(data, "phone/calibration.toml")
+        model.calibration_from_dict(data, "phone/calibration.toml")
     for part in parts:
         assert part in str(e.value)
 
@@ -51,18 +53,18 @@ def test_faults_name_file_key_and_value(data, parts):
 def test_files(tmp_path):
     path = tmp_path / "calibration.toml"
     with pytest.raises(CalibrationError, match=r"calibration.toml: cannot be read \(No such file or directory\)"):
-        model.load(path)
+        model.load_calibration(path)
     path.write_text("device = ")
     with pytest.raises(CalibrationError, match=r"is no TOML \("):
-        model.load(path)
+        model.load_calibration(path)
     path.write_bytes(b"\xff")
     with pytest.raises(CalibrationError, match=r"is no TOML \("):
-        model.load(path)
-    path.write_text(model.dumps(Calibration(device="phone")))
-    assert model.load(path) == Calibration(device="phone")
+        model.load_calibration(path)
+    path.write_text(model.calibration_toml(Calibration(device="phone")))
+    assert model.load_calibration(path) == Calibration(device="phone")
     path.write_text("[imu_noise]\ngyro_noise_density = -1.0")
     with pytest.raises(CalibrationError, match=r"gyro_noise_density = -1\.0"):
-        model.load(path)
+        model.load_calibration(path)
 
 
 def test_every_default_is_a_physical_mems():
@@ -76,9 +78,9 @@ def test_the_irons_of_a_magnetometer_survive_the_text():
     soft = (1.1, 0.02, 0.0, 0.02, 0.9, 0.01, 0.0, 0.01, 1.05)
     noise = MagnetometerNoise(hard_iron_ut=(12.0, -30.5, 7.0), hard_iron_sigma_ut=0.8, soft_iron=soft)
     calibration = Calibration(magnetometer_noise=noise)
-    assert model.from_dict(tomllib.loads(model.dumps(calibration))) == calibration
+    assert model.calibration_from_dict(tomllib.loads(model.calibration_toml(calibration))) == calibration
 
 
 def test_a_soft_iron_of_eight_numbers_is_refused_with_the_file():
     with pytest.raises(CalibrationError, match=r"^phone.toml: .*soft_iron.*expected"):
-        model.from_dict({"magnetometer_noise": {"soft_iron": [1.0] * 8}}, "phone.toml")
+        model.calibration_from_dict({"magnetometer_noise": {"soft_iron": [1.0] * 8}}, "phone.toml")
