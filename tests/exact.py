@@ -133,16 +133,17 @@ def assemble(
     keyframes: KeyframeConfig | None = None,
     span: tuple[int, int] | None = None,
     known: Mapping[str, Any] = MappingProxyType({}),
+    options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Graph:
     """The graph of `session` with every step built at the states that `truth` and `bias` tell; `known` are the true
-    values of session states by name, the others stand at their initial ones."""
+    values of session states by name, the others stand at their initial ones; `options` are sections of the config."""
     keyframes = keyframes or KeyframeConfig()
     imu = session.require_imu()
     span = span or (int(imu.t_ns[0]), int(imu.t_ns[-1]))
     aiding = {name: stream.t_ns for name, stream in session.absolute().items()}
     times = keyframe_times(span, list(aiding.values()), gaps, keyframes)
     windows = make_windows(imu, times, gaps, aiding, keyframes)
-    calibration, config = session.calibration or Calibration(), Config(gnss=GnssConfig(loss="none"))
+    calibration, config = session.calibration or Calibration(), Config(**{"gnss": GnssConfig(loss="none")} | options)
     context = FactorContext(session, calibration, gaps, session.device.vehicle, config)
     builders = {builder.name: builder for builder in make_builders(context)}
     there, biases = truth(times), bias(times)

@@ -40,6 +40,7 @@ class Case:
     record : its recording, exact for None, noisy for a seed; honest : largest |component| at the truth, in sigma
     mutations : name -> (mistake, rms over the rows it must exceed, in sigma); known : true session states
     stream : stream and field whose broken numbers are refused; noisy : whether its sigma is that of simulated noise
+    options : sections of the configuration, for a factor that is off by default
     lookahead_s : what it may see of the time after a keyframe; cut : inertial samples of the shorter recording
     """
 
@@ -47,10 +48,16 @@ class Case:
     honest: float
     mutations: Mapping[str, tuple[Wrong, float]]
     known: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     stream: tuple[str, str] | None = None
     noisy: bool = True
     lookahead_s: float = 0.0
     cut: int = 1300
+
+    def graph(self, made: Recording, session: Session | None = None) -> Graph:
+        """The graph of the recording, or of a changed session, at the true states."""
+        states = {"bias": made.bias, "known": self.known}
+        return assemble(session or made.session, made.truth, pass_state=MEMORY, options=self.options, **states)
 
 
 # --- recordings -------------------------------------------------------------------------------------------------------
@@ -317,9 +324,7 @@ MISTAKES = [(sensor, name) for sensor, case in CASES.items() for name in case.mu
 
 @cache
 def graph_of(sensor: str, seed: int | None = None) -> Graph:
-    case = CASES[sensor]
-    made = case.record(seed)
-    return assemble(made.session, made.truth, bias=made.bias, pass_state=MEMORY, known=case.known)
+    return CASES[sensor].graph(CASES[sensor].record(seed))
 
 
 def white(graph: Graph, sensor: str) -> np.ndarray:
@@ -343,7 +348,7 @@ def test_a_mistake_shows_in_the_residual(sensor, name):
     case = CASES[sensor]
     wrong, floor = case.mutations[name]
     made = case.record(None)
-    found = rms(white(assemble(wrong(made.session), made.truth, pass_state=MEMORY, known=case.known), sensor))
+    found = rms(white(case.graph(made, wrong(made.session)), sensor))
     assert found > floor > 2 * case.honest, found
 
 
@@ -380,7 +385,7 @@ def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor):
         **{name: stream.take(stream.t_ns <= cut) for name, stream in made.session.streams().items()}
     )
     full = graph_of(sensor)
-    part = assemble(shorter, made.truth, pass_state=MEMORY, known=case.known)
+    part = case.graph(made, shorter)
     # without fixes keyframes stand at full seconds; else later windows end where the recording does
     last = max((w.t1_ns for w in part.windows if w.rows), default=cut)
     known = min(last, cut - ns_from_seconds(case.lookahead_s))
