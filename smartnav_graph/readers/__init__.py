@@ -112,16 +112,16 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
 
 
 def _without_pictures(found: Session) -> Session:
-    """The session of an archive: its pictures are gone with the unpacked folder, which is told where there were any."""
+    """The session of an archive without its pictures, which are gone with the unpacked folder, and are counted."""
     folder = found.pictures
     files = [] if found.images is None or folder is None else [f for f in map(str, found.images.file) if f]
     lost = sum((folder / file).is_file() for file in files) if folder is not None else 0
-    told = {"images": {"pictures left in the archive (unpack it, and import the folder)": lost}} if lost else {}
-    return found.replace(pictures=None, dropped={**found.dropped, **told})
+    counts = {"images": {"pictures left in the archive (unpack it, and import the folder)": lost}} if lost else {}
+    return found.replace(pictures=None, dropped={**found.dropped, **counts})
 
 
 def _entry(folder: Path) -> Path:
-    """The only file of an unpacked folder, where it is a log by itself; else the folder."""
+    """The only file of an unpacked folder, where a reader recognises it; else the folder."""
     files = list(folder.iterdir())
     alone = len(files) == 1 and any(reader.matches(str(files[0])) for reader in READERS.values())
     return files[0] if alone else folder

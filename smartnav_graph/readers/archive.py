@@ -1,4 +1,4 @@
-"""Zip and tar archives: unpacked beside nothing of the user's, read, and gone again."""
+"""Zip and tar archives: unpacked to a temporary folder that is removed after reading."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.core.so3 import from_quaternion
 from smartnav_graph.core.timebase import NS
@@ -27,7 +27,7 @@ from smartnav_graph.session.session import Device, Session
 
 NAME = "colmap"
 
-# Camera model -> (where fx, fy, cx, cy stand among the parameters, where the distortion stands, model of ours).
+# Camera model -> (indices of fx, fy, cx, cy among the parameters, indices of the distortion, our model).
 _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int, ...], str]] = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "brown"),
     "PINHOLE": ((0, 1, 2, 3), (), "brown"),
@@ -87,7 +87,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     )
 
 
-def _nav_poses(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nav_poses(cam_from_world: Floats) -> Floats:
     """nav_T_camera (n, 4, 4) of rows qw qx qy qz tx ty tz."""
     cam_T_world = np.tile(np.eye(4), (len(cam_from_world), 1, 1))
     cam_T_world[:, :3, :3] = from_quaternion(cam_from_world[:, :4])
@@ -117,8 +117,8 @@ def _cameras(path: Path) -> Iterator[tuple[str, Camera]]:
         try:
             width, height, *numbers = (float(cell) for cell in cells if cell)
             fx, fy, cx, cy = (numbers[i] for i in places)
-            bent = [numbers[i] for i in distortion]
-            padded = (*bent, *[0.0] * (-len(bent) % 4))
+            coefficients = [numbers[i] for i in distortion]
+            padded = (*coefficients, *[0.0] * (-len(coefficients) % 4))
             yield key, Camera(int(width), int(height), fx, fy, cx - 0.5, cy - 0.5, model, padded)
         except (ValueError, IndexError) as error:
             raise SessionError(where, f"is no camera ({error})", f"size and parameters of {name}") from error

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import ns_from_texts
-from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, vector_columns
 from smartnav_graph.session.session import Device, Session
 
 NAME = "comma2k19"
@@ -47,7 +47,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return build_session(tables, repairs, device=device, clock_epoch="boot", origin=origin)
 
 
-def _imu_columns(root: Path) -> Columns:
+def _imu_columns(root: Path) -> Table:
     accel, gyro = (_values(root / IMU / name / "value", 3) for name in ("accelerometer", "gyro"))
     t_ns = _times(root / IMU / "accelerometer" / "t", len(accel))
     if not np.array_equal(t_ns, _times(root / IMU / "gyro" / "t", len(gyro))):
@@ -55,7 +55,7 @@ def _imu_columns(root: Path) -> Columns:
     return {"t_ns": t_ns} | vector_columns("gyro_{}_rad_s", gyro) | vector_columns("accel_{}_m_s2", accel)
 
 
-def _fix_columns(root: Path) -> Columns:
+def _fix_columns(root: Path) -> Table:
     """Columns of the log: latitude, longitude deg, speed m/s, UTC ms, ellipsoidal height m, bearing deg.
 
     Speed, bearing and UTC stay beside the fix; a horizontal speed is no velocity vector.
@@ -65,11 +65,11 @@ def _fix_columns(root: Path) -> Columns:
     return {"t_ns": _times(root / FIXES / "t", len(rows))} | dict(zip(names, rows.T, strict=True))
 
 
-def _reference_columns(folder: Path, frame: LocalFrame) -> Columns:
+def _reference_columns(folder: Path, frame: LocalFrame) -> Table:
     ecef, velocity = (_values(folder / name, 3) for name in ("frame_positions", "frame_velocities"))
     ecef_R_body = from_quaternion(_values(folder / "frame_orientations", 4))
     quat = quaternion(frame.nav_R_ecef @ ecef_R_body)
-    columns: Columns = {"t_ns": _times(folder / "frame_times", len(ecef))}
+    columns: Table = {"t_ns": _times(folder / "frame_times", len(ecef))}
     columns |= vector_columns("{}_m", frame.nav_from_ecef(ecef), "enu")
     columns |= dict(zip(("qw", "qx", "qy", "qz"), quat.T, strict=True))
     return columns | vector_columns("v{}_m_s", velocity @ frame.nav_R_ecef.T, "enu")

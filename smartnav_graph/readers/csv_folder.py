@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Column, Table
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.readers.source import Columns, Reader, build_session
+from smartnav_graph.readers.source import Reader, build_session
 from smartnav_graph.readers.text import TextTable, read_text
 from smartnav_graph.session import repair
 from smartnav_graph.session.folder import read_header
@@ -35,7 +34,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         raise SessionError(folder, "holds no stream", f"some of {known}", "name each file after its stream")
     for other in sorted(set(folder.glob("*.csv")) - set(files.values())):
         raise SessionError(other, "is no stream of a session", f"some of {known}", "rename the file or move it away")
-    header: dict[str, Any] = read_header(folder) if (folder / "session.toml").exists() else {}
+    header = read_header(folder) if (folder / "session.toml").exists() else {}
     wanted = repair.check_names({*header.pop("repairs", ()), *repairs})
     tables = {name: (file, _columns(STREAMS[name], read_text(file))) for name, file in files.items()}
     try:
@@ -44,14 +43,14 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         raise error.located(files[error.where]) if error.where in files else error from error
 
 
-def _columns(kind: type[Stream], table: TextTable) -> Columns:
-    """Every column by its kind. A wholly empty optional column is one that is not there; unknown ones are told."""
+def _columns(kind: type[Stream], table: TextTable) -> Table:
+    """Every column by its kind. An empty optional column counts as missing; unknown ones are kept with a warning."""
     kinds = {name: spec.metadata["kind"] for spec in kind.specs() for name in spec.metadata["columns"]}
     optional = {name for spec in kind.specs() if spec.default is None for name in spec.metadata["columns"]}
     unknown = ", ".join(name for name in table.cells if name not in kinds)
     if unknown:
         _log.warning("%s: unknown column %s; kept, but not used", table.path, unknown)
-    columns: Columns = {}
+    columns: Table = {}
     for name in table.cells:
         if name in optional and table.is_empty(name):
             continue
@@ -59,7 +58,7 @@ def _columns(kind: type[Stream], table: TextTable) -> Columns:
     return columns
 
 
-def _column(table: TextTable, name: str, kind: str | None) -> NDArray[Any]:
+def _column(table: TextTable, name: str, kind: str | None) -> Column:
     if kind == "int":
         return table.ints(name)
     if kind == "float":

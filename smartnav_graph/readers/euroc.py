@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.readers.reference import euroc_columns
-from smartnav_graph.readers.source import Columns, Reader, build_session, mount, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, mount, vector_columns
 from smartnav_graph.readers.text import read_bytes, read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
@@ -25,7 +25,7 @@ from smartnav_graph.session.session import Device, Mount, Session
 NAME = "euroc"
 GRAVITY = 9.81
 # The cameras are triggered by the clock of the IMU, and were calibrated with it to hundredths of a degree (Furgale et
-# al. 2013, Kalibr): images of a flight tell less of their attitude.
+# al. 2013, Kalibr): images of a flight determine their attitude less well.
 calibrated = partial(Camera, boresight_sigma_deg=0.0, time_offset_sigma_s=0.002)
 GROUND_TRUTH = Path("state_groundtruth_estimate0", "data.csv")
 
@@ -66,15 +66,15 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     )
 
 
-def _imu_columns(path: Path) -> Columns:
+def _imu_columns(path: Path) -> Table:
     table = read_text(path, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
     gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
     return {"t_ns": table.ints("t")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
 
 
-def _image_columns(root: Path, cameras: list[str]) -> Columns:
+def _image_columns(root: Path, cameras: list[str]) -> Table:
     """One row an image of any camera, by time; file names count from the ASL folder."""
-    t_ns: list[NDArray[np.int64]] = []
+    t_ns: list[Times] = []
     files: list[str] = []
     names: list[str] = []
     for camera in cameras:
@@ -134,7 +134,7 @@ def _numbers(path: Path, text: str, name: str) -> list[float]:
         raise SessionError(path, f"{name} is no list of numbers ({error})", f"{name}: [1, 2, ...]") from error
 
 
-def _extrinsics(path: Path) -> NDArray[np.float64]:
+def _extrinsics(path: Path) -> Floats:
     found = _T_BS.search(read_bytes(path).decode("utf-8", errors="replace"))
     try:
         numbers = np.array(found[1].split(",") if found else [], dtype=np.float64)

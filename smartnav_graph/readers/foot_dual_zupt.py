@@ -11,13 +11,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Column, Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.matlab import matrix, read_mat
-from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, vector_columns
 from smartnav_graph.readers.text import first_lines, read_text
 from smartnav_graph.session.session import Device, Session
 
@@ -26,7 +25,7 @@ RATE_HZ = 60
 NAV_FROM_FILE = np.array([1.0, -1.0, -1.0])
 FEET = ("left", "right")
 MATLAB = Path("dataPreparation")
-# In the whole recording: the inertial columns of a foot start here, and its positions stand in this file.
+# In the whole recording: first inertial column of a foot, and file and variable of its positions.
 FIRST_COLUMN = {"right": 0, "left": 6}
 POSITIONS = {"right": ("posFoot.mat", "posFoot"), "left": ("posLeft.mat", "posLeft")}
 HEADING = "time_index,acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z"
@@ -61,7 +60,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return build_session(tables, repairs, device=device, clock_epoch="unknown")
 
 
-def _whole(folder: Path, foot: str) -> dict[str, tuple[Path, Columns]]:
+def _whole(folder: Path, foot: str) -> dict[str, tuple[Path, Table]]:
     """The recording of 290 s."""
     inertial, (name, variable) = folder / "ImuFootLeft.mat", POSITIONS[foot]
     first = FIRST_COLUMN[foot]
@@ -71,7 +70,7 @@ def _whole(folder: Path, foot: str) -> dict[str, tuple[Path, Columns]]:
     return {"imu": (inertial, _imu(index, rows)), "reference": (folder / name, _reference(index, position))}
 
 
-def _walk(path: Path) -> dict[str, tuple[Path, Columns]]:
+def _walk(path: Path) -> dict[str, tuple[Path, Table]]:
     """The evaluated walk of 120 s; its clock starts anew."""
     table = read_text(path)
     table.require(HEADING.split(","))
@@ -87,17 +86,17 @@ def _walk(path: Path) -> dict[str, tuple[Path, Columns]]:
     return tables
 
 
-def _times(index: NDArray[np.generic]) -> NDArray[np.int64]:
+def _times(index: Column) -> Times:
     """Nanoseconds of row numbers."""
     return np.rint(np.asarray(index, dtype=np.float64) * (NS / RATE_HZ)).astype(np.int64)
 
 
-def _imu(index: NDArray[np.generic], rows: Floats) -> Columns:
+def _imu(index: Column, rows: Floats) -> Table:
     t_ns = {"t_ns": _times(index)}
     return t_ns | vector_columns("gyro_{}_rad_s", rows[:, 3:]) | vector_columns("accel_{}_m_s2", rows[:, :3])
 
 
-def _reference(index: NDArray[np.generic], position: Floats) -> Columns:
+def _reference(index: Column, position: Floats) -> Table:
     return {"t_ns": _times(index)} | vector_columns("{}_m", position * NAV_FROM_FILE, "enu")
 
 

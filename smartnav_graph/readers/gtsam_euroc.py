@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from smartnav_graph.core.arrays import Table
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import from_quaternion
 from smartnav_graph.readers.euroc import calibrated
-from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, mount, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, example_file, mount, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
@@ -62,13 +63,13 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     )
 
 
-def _imu_columns(table: TextTable) -> Columns:
+def _imu_columns(table: TextTable) -> Table:
     table.require(("gx", "gy", "gz", "ax", "ay", "az"))
     gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
     return {"t_ns": table.times("t_abs")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
 
 
-def _image_columns(features: TextTable) -> Columns:
+def _image_columns(features: TextTable) -> Table:
     """One row a frame. There are tracks but no pictures: the file name stays empty."""
     frames, first = np.unique(features.ints("frame_idx"), return_index=True)
     return {
@@ -79,7 +80,7 @@ def _image_columns(features: TextTable) -> Columns:
     }
 
 
-def _track_columns(features: TextTable) -> Columns:
+def _track_columns(features: TextTable) -> Table:
     return {
         "t_ns": features.times("t_abs"),
         "image_id": features.ints("frame_idx"),

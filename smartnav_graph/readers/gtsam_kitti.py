@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from smartnav_graph.readers.source import Columns, Reader, build_session, example_file, vector_columns
+from smartnav_graph.core.arrays import Table
+from smartnav_graph.readers.source import Reader, build_session, example_file, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session.session import Device, Session
 
@@ -44,13 +45,13 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return build_session(tables, repairs, device=device, gravity_m_s2=GRAVITY)
 
 
-def _imu_columns(table: TextTable) -> Columns:
+def _imu_columns(table: TextTable) -> Table:
     table.require(("Time", *_GYRO, *_ACCEL))
     gyro = vector_columns("gyro_{}_rad_s", table.floats(*_GYRO))
     return {"t_ns": table.times("Time")} | gyro | vector_columns("accel_{}_m_s2", table.floats(*_ACCEL))
 
 
-def _fix_columns(table: TextTable) -> Columns:
+def _fix_columns(table: TextTable) -> Table:
     table.require(("Time", "X", "Y", "Z"))
     return {"t_ns": table.times("Time")} | vector_columns("{}_m", table.floats("X", "Y", "Z"), "enu")
 

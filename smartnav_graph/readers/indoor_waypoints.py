@@ -4,13 +4,13 @@ Lines of text, tab separated: Unix time in ms, type, values. Read are TYPE_ACCEL
 TYPE_GYROSCOPE (rad/s, the system's bias taken off) and TYPE_WAYPOINT (x right, y up, metres on the plan). Phone axes:
 x right, y top, z out of the screen. Nothing ties the plan to north: magnetic field and rotation vector are left.
 
-A waypoint is a place that the walker tapped on the map: `LABEL_SIGMA`. The floor is flat and the phone is carried at
+A waypoint is a place tapped on the map: `LABEL_SIGMA`. The floor is flat and the phone is carried at
 one height, which is zero here: `HEIGHT_SIGMA`. The first waypoint is tapped a moment before the sensors start;
-waypoints outside the inertial span by at most `EDGE_S` stand at its first or last sample, counted in
+waypoints outside the inertial span by at most `EDGE_S` are moved to its first or last sample, counted in
 `Session.dropped`.
 
-The recorder polls: all sensors share its stamps, and a reading is up to one period old. That is noise where the phone
-shakes, and the calibration that comes with the session says so (`polled_noise`).
+The recorder polls: all sensors share its stamps, and a reading is up to one period old. Where the phone shakes that is
+noise, which the calibration of the session includes (`polled_noise`).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_bytes
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, ImuNoise
 from smartnav_graph.session.session import Device, Session
@@ -34,7 +34,7 @@ NAME = "indoor-waypoints"
 MS = NS // 1000
 LABEL_SIGMA = 0.7  # m per axis: labels lie 0.5 to 1 m beside the line that was walked
 HEIGHT_SIGMA = 0.2  # m
-EDGE_S = 0.5  # a walker moves less than the label is good for
+EDGE_S = 0.5  # a pedestrian moves less than the sigma of a label
 
 VALUES = {
     "TYPE_ACCELEROMETER": ("x", "y", "z"),
@@ -52,7 +52,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     path = Path(source)
     tables = _tables(path)
     imu = _imu(path, tables)
-    control, moved = _control(path, tables["TYPE_WAYPOINT"], imu["t_ns"])
+    control, moved = _control(path, tables["TYPE_WAYPOINT"], np.asarray(imu["t_ns"], dtype=np.int64))
     session = build_session(
         {"imu": (path, imu), "control": (path, control)},
         repairs,
@@ -106,11 +106,11 @@ def _records(path: Path) -> dict[str, list[list[str]]]:
     return rows
 
 
-def _vectors(table: TextTable) -> NDArray[np.float64]:
+def _vectors(table: TextTable) -> Floats:
     return table.floats(*(name for name in table.cells if name != "t"))
 
 
-def _imu(path: Path, tables: dict[str, TextTable]) -> Columns:
+def _imu(path: Path, tables: dict[str, TextTable]) -> Table:
     accel, gyro = tables["TYPE_ACCELEROMETER"], tables["TYPE_GYROSCOPE"]
     t_ns = accel.times("t", MS)
     if not np.array_equal(t_ns, gyro.times("t", MS)):
@@ -129,7 +129,7 @@ def polled_noise(imu: Imu) -> ImuNoise:
     """
     usual, period = DEVICE_CLASSES["mems"], float(np.median(np.diff(imu.t_ns))) / NS
 
-    def density(rows: NDArray[np.float64]) -> float:
+    def density(rows: Floats) -> float:
         return float(np.sqrt((np.diff(rows, axis=0) ** 2).mean() / 12.0 * period))
 
     return replace(
@@ -139,7 +139,7 @@ def polled_noise(imu: Imu) -> ImuNoise:
     )
 
 
-def _control(path: Path, table: TextTable, imu_ns: NDArray[np.int64]) -> tuple[Columns, int]:
+def _control(path: Path, table: TextTable, imu_ns: Times) -> tuple[Table, int]:
     """Columns of the waypoints, and how many were moved into the inertial span."""
     recorded, xy = table.times("t", MS), _vectors(table)
     inside = np.clip(recorded, imu_ns[0], imu_ns[-1])

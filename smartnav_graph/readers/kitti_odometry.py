@@ -8,15 +8,14 @@ viewing direction north. Without times.txt pictures count as 0.1 s apart, from z
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from smartnav_graph.core.arrays import Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.reference import pose_columns
-from smartnav_graph.readers.source import Columns, Reader, build_session, mount
+from smartnav_graph.readers.source import Reader, build_session, mount
 from smartnav_graph.readers.text import read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
@@ -65,27 +64,28 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     )
 
 
-def _images(files: list[str], t_ns: NDArray[np.int64]) -> Columns:
+def _images(files: list[str], t_ns: Times) -> Table:
     names = np.array(files, dtype=object)
     return {"t_ns": t_ns, "image_id": np.arange(len(files)), "file": names, "camera": np.full_like(names, CAMERA)}
 
 
-def _times(path: Path, count: int) -> NDArray[np.int64]:
+def _times(path: Path, count: int) -> Times:
     if not path.is_file():
         return np.arange(count, dtype=np.int64) * PERIOD_NS
-    return _rows(path, read_text(path, names=["t"]).times("t"), count)
+    t_ns = read_text(path, names=["t"]).times("t")
+    _check_count(path, len(t_ns), count)
+    return t_ns
 
 
-def _poses(path: Path, count: int) -> Columns:
+def _poses(path: Path, count: int) -> Table:
     table = read_text(path, names=[f"p{i}" for i in range(12)])
-    rows = _rows(path, table.floats(*table.cells), count).reshape(-1, 3, 4)
-    return pose_columns(path, NAV_R_CAMERA @ rows)
+    _check_count(path, len(table), count)
+    return pose_columns(path, NAV_R_CAMERA @ table.floats(*table.cells).reshape(-1, 3, 4))
 
 
-def _rows(path: Path, rows: NDArray[Any], count: int) -> NDArray[Any]:
-    if len(rows) != count:
-        raise SessionError(path, f"has {len(rows)} rows", f"{count}, one a picture", "give the whole sequence")
-    return rows
+def _check_count(path: Path, rows: int, count: int) -> None:
+    if rows != count:
+        raise SessionError(path, f"has {rows} rows", f"{count}, one a picture", "give the whole sequence")
 
 
 def _camera(path: Path, picture: Path) -> Camera:

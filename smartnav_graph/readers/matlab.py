@@ -1,13 +1,12 @@
-"""MATLAB files (version 5) -> named arrays, with faults told by file and variable."""
+"""MATLAB files (version 5) -> named arrays, errors name the file and the variable."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Table
 from smartnav_graph.core.errors import SessionError
 
 
@@ -23,7 +22,7 @@ def names_in(path: Path) -> frozenset[str]:
         return frozenset()
 
 
-def read_mat(path: Path) -> dict[str, Any]:
+def read_mat(path: Path) -> Table:
     """The variables of a file.
 
     Raises
@@ -41,7 +40,7 @@ def read_mat(path: Path) -> dict[str, Any]:
         raise SessionError(path, f"cannot be read ({error})", "a MATLAB file of version 5") from error
 
 
-def matrix(path: Path, variables: dict[str, Any], name: str, width: int, rows: int | None = None) -> Floats:
+def matrix(path: Path, variables: Table, name: str, width: int, rows: int | None = None) -> Floats:
     """One variable as numbers (rows, width); rows of any count by default.
 
     Raises

@@ -9,19 +9,18 @@ heights: the reference's is zero, that of a marked point is unknown (`UNKNOWN_HE
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.readers.matlab import matrix, names_in, read_mat
-from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, vector_columns
 from smartnav_graph.session.session import Device, Session
 
 NAME = "pyshoe"
-# Sigmas, metres: a foot's IMU is a shoe's width from the point it stands on; the floor's height was not measured.
+# Sigmas, metres: a foot's IMU is a shoe's width away from the marked point; heights of the floor were not measured.
 ON_THE_POINT = 0.1
 UNKNOWN_HEIGHT = 100.0
 
@@ -37,7 +36,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     vicon = "gt" in variables
     t_ns = _times(path, variables, "timestamps_all" if vicon else "timestamps", len(rows))
     imu = vector_columns("gyro_{}_rad_s", rows[:, 3:]) | vector_columns("accel_{}_m_s2", rows[:, :3])
-    tables: dict[str, tuple[Path, Columns]] = {"imu": (path, {"t_ns": t_ns} | imu)}
+    tables: dict[str, tuple[Path, Table]] = {"imu": (path, {"t_ns": t_ns} | imu)}
     if vicon:
         position = _level(matrix(path, variables, "gt", 2, len(rows)))
         tables["reference"] = (path, {"t_ns": t_ns} | vector_columns("{}_m", position, "enu"))
@@ -47,9 +46,9 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return build_session(tables, repairs, device=device, clock_epoch="unknown")
 
 
-def _times(path: Path, variables: dict[str, Any], name: str, count: int) -> Times:
+def _times(path: Path, variables: Table, name: str, count: int) -> Times:
     """Stamps of seconds since the recording's start."""
-    seconds = np.ravel(variables.get(name, ()))
+    seconds = np.ravel(variables[name]) if name in variables else np.zeros(0)
     if seconds.shape != (count,):
         raise SessionError(path, f"{name} has {len(seconds)} stamps", f"{count}, one an inertial row")
     return ns_from_seconds(seconds)
@@ -60,7 +59,7 @@ def _level(position: Floats) -> Floats:
     return np.column_stack([position[:, 0], -position[:, 1], np.zeros(len(position))])
 
 
-def _points(path: Path, variables: dict[str, Any], t_ns: Times) -> Columns:
+def _points(path: Path, variables: Table, t_ns: Times) -> Table:
     """Marked points at the middle of the strides' stances."""
     stride = np.ravel(variables["strideIndex"]).astype(np.int64)
     if len(stride) and not (stride.min() >= 0 and stride.max() < len(t_ns)):
@@ -68,7 +67,7 @@ def _points(path: Path, variables: dict[str, Any], t_ns: Times) -> Columns:
     points = _level(matrix(path, variables, "GCP", 2, len(stride)))
     sigma = np.tile([ON_THE_POINT, ON_THE_POINT, UNKNOWN_HEIGHT], (len(stride), 1))
     names = np.array([f"stride {i}" for i in range(len(stride))], dtype=object)
-    columns: Columns = {"t_ns": t_ns[stride], "point_id": names}
+    columns: Table = {"t_ns": t_ns[stride], "point_id": names}
     return columns | vector_columns("{}_m", points, "enu") | vector_columns("sigma_{}_m", sigma, "enu")
 
 

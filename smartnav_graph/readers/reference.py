@@ -14,14 +14,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.files import read_table, read_toml
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.readers.source import Columns, vector_columns
+from smartnav_graph.readers.source import vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session.folder import build_stream
 from smartnav_graph.session.streams import Reference
@@ -60,7 +59,7 @@ def load_reference(
     SessionError
         Missing or unreadable file, unknown format, no number, times out of order, quaternion not of unit norm.
     ConfigError
-        `times` or `body_T_ref` is missing where needed, or given where it says nothing.
+        `times` or `body_T_ref` is missing where needed, or given where it does not apply.
     """
     path = Path(path)
     if path.is_dir() or path.suffix == ".parquet":
@@ -74,10 +73,10 @@ def load_reference(
     if times is not None:
         raise ConfigError("--times", f"is given, but {file} has times of its own", "KITTI poses", "leave it out")
     _check_unit(file, columns)
-    return _built(file, columns if body_T_ref is None else _moved(file, columns, load_transform(body_T_ref)))
+    return _built(file, columns if body_T_ref is None else _of_body(file, columns, load_transform(body_T_ref)))
 
 
-def _columns(path: Path, lines: list[str]) -> Columns:
+def _columns(path: Path, lines: list[str]) -> Table:
     if _is_euroc(lines):
         return euroc_columns(path)
     if _is_tum(lines):
@@ -115,12 +114,12 @@ def _is_euroc(lines: list[str]) -> bool:
     return heading.startswith("#time") and heading.count(",") + 1 in (8, 11, 17)
 
 
-def _tum(path: Path) -> Columns:
+def _tum(path: Path) -> Table:
     table = read_text(path, names=("t", *_POSITION, "qx", "qy", "qz", "qw"))
     return _pose_columns(table, table.times("t"))
 
 
-def euroc_columns(path: Path) -> Columns:
+def euroc_columns(path: Path) -> Table:
     """File columns of a EuRoC ground-truth CSV: time in ns, position, quaternion w first, velocity, biases."""
     width = first_lines(path, 1)[0].count(",") + 1 if first_lines(path, 1) else len(_EUROC)
     table = read_text(path, names=_EUROC[:width])
@@ -133,7 +132,7 @@ def euroc_columns(path: Path) -> Columns:
     return columns
 
 
-def _pose_columns(table: TextTable, t_ns: NDArray[np.int64]) -> Columns:
+def _pose_columns(table: TextTable, t_ns: Times) -> Table:
     position = vector_columns("{}_m", table.floats(*_POSITION), "enu")
     return {"t_ns": t_ns} | position | {name: table.floats(name) for name in QUATERNION}
 
@@ -142,7 +141,7 @@ def _time_name(table: TextTable) -> str | None:
     return next((name for name in table.cells if name.lower() in _TIME_UNITS), None)
 
 
-def _named(table: TextTable) -> Columns:
+def _named(table: TextTable) -> Table:
     time = _time_name(table)
     assert time is not None  # the caller looked
     lower = TextTable(table.path, {name.lower(): cells for name, cells in table.cells.items()})
@@ -153,7 +152,7 @@ def _named(table: TextTable) -> Columns:
     return columns | {name: lower.floats(name) for name in lower.cells if name in known and not lower.is_empty(name)}
 
 
-def _named_times(table: TextTable, name: str) -> NDArray[np.int64]:
+def _named_times(table: TextTable, name: str) -> Times:
     unit = _TIME_UNITS[name]
     if unit == NS and np.abs(table.floats(name)).max() > _LARGEST_S:
         found = f"{name} begins with {table.texts(name)[0]}"
@@ -161,7 +160,7 @@ def _named_times(table: TextTable, name: str) -> NDArray[np.int64]:
     return table.times(name, unit)
 
 
-def _kitti(path: Path, times: str | Path | None, body_T_ref: str | Path | None) -> Columns:
+def _kitti(path: Path, times: str | Path | None, body_T_ref: str | Path | None) -> Table:
     for option, value, what in (
         ("--times", times, "a file with one time in seconds a row"),
         ("--body-T-ref", body_T_ref, "a TOML file with body_T_cam, the camera's pose in the body"),
@@ -186,7 +185,7 @@ def _homogeneous(rows: Floats) -> Floats:
     return np.concatenate([rows, bottom], axis=1)
 
 
-def _moved(path: Path, columns: Columns, body_T_ref: Floats) -> Columns:
+def _of_body(path: Path, columns: Table, body_T_ref: Floats) -> Table:
     """The body's poses from those of a frame fixed to it. Velocity and biases of that frame are left out."""
     if "qw" not in columns:
         raise ConfigError("--body-T-ref", f"is given, but {path} has no attitude", "qw, qx, qy, qz", "leave it out")
@@ -196,7 +195,7 @@ def _moved(path: Path, columns: Columns, body_T_ref: Floats) -> Columns:
     return {"t_ns": columns["t_ns"]} | _columns_of(poses @ np.linalg.inv(body_T_ref))
 
 
-def pose_columns(path: Path, poses: Floats) -> Columns:
+def pose_columns(path: Path, poses: Floats) -> Table:
     """File columns of the body's poses (n, 3, 4) or (n, 4, 4) in nav.
 
     Raises
@@ -208,12 +207,12 @@ def pose_columns(path: Path, poses: Floats) -> Columns:
     return _columns_of(poses)
 
 
-def _columns_of(poses: Floats) -> Columns:
+def _columns_of(poses: Floats) -> Table:
     quat = quaternion(poses[:, :3, :3])
     return vector_columns("{}_m", poses[:, :3, 3], "enu") | dict(zip(QUATERNION, quat.T, strict=True))
 
 
-def _stack(columns: Columns, *names: str) -> Floats:
+def _stack(columns: Table, *names: str) -> Floats:
     return np.stack([np.asarray(columns[name], dtype=np.float64) for name in names], axis=-1)
 
 
@@ -254,7 +253,7 @@ def _check_rotations(path: Path, poses: Floats) -> None:
         )
 
 
-def _check_unit(path: Path, columns: Columns) -> None:
+def _check_unit(path: Path, columns: Table) -> None:
     if not all(name in columns for name in QUATERNION):
         return
     norm = np.linalg.norm(_stack(columns, *QUATERNION), axis=1)
@@ -270,7 +269,7 @@ def _check_unit(path: Path, columns: Columns) -> None:
         )
 
 
-def _built(path: Path, columns: Columns) -> Reference:
+def _built(path: Path, columns: Table) -> Reference:
     stream, _ = build_stream(Reference, columns, path)
     assert isinstance(stream, Reference)
     return stream

@@ -1,4 +1,4 @@
-"""What a reader is: a name, how it recognises a source, and how it turns one into a session."""
+"""A reader: its name, how it recognises a source, and how it converts one to a session."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from smartnav_graph.core.arrays import Floats, Table
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.session.folder import build_stream
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
-
-Columns = dict[str, NDArray[Any]]
 
 
 class ReadFunction(Protocol):
@@ -31,7 +30,7 @@ class Reader:
 
     name : what ``--format`` calls it
     summary : what it is, one line
-    recognised_by : how a source is told to be of this format, one line
+    recognised_by : how a source of this format is recognised, one line
     matches : cheap check of names and first lines; never raises for a source of another format
     read_source : the conversion itself
     """
@@ -58,7 +57,7 @@ class Reader:
         return self.read_source(str(source), tuple(repairs))
 
 
-def vector_columns(template: str, rows: NDArray[np.float64], axes: str = "xyz") -> Columns:
+def vector_columns(template: str, rows: Floats, axes: str = "xyz") -> Table:
     """Columns of the rows (n, k) of a vector: ``{}`` in `template` becomes the axis."""
     return {template.format(axis): column for axis, column in zip(axes, rows.T, strict=True)}
 
@@ -70,7 +69,7 @@ def mount(body_t: ArrayLike, body_R: ArrayLike) -> Mount:
     return Mount(body_t=(x, y, z), body_R=rows)
 
 
-def build_session(tables: Mapping[str, tuple[Path, Columns]], repairs: tuple[str, ...], **header: Any) -> Session:
+def build_session(tables: Mapping[str, tuple[Path, Table]], repairs: tuple[str, ...], **header: Any) -> Session:
     """A session of file columns: stream name -> (file they came from, columns).
 
     The repairs are done here and counted in `Session.dropped`; `Session.repairs` stays empty, because a session

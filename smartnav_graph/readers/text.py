@@ -1,4 +1,4 @@
-"""Delimited text -> columns, with faults told by file, row and value."""
+"""Delimited text -> columns, errors name the file, the row and the value."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 import pyarrow.csv
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_text, ns_from_texts
 
@@ -75,7 +73,7 @@ class TextTable:
         mask = pa.compute.equal(self.cells[name], value)
         return TextTable(self.path, {column: cells.filter(mask) for column, cells in self.cells.items()})
 
-    def texts(self, name: str) -> NDArray[Any]:
+    def texts(self, name: str) -> Texts:
         """Cells as text (object array); empty where empty."""
         return np.array(self.cells[name].to_pylist(), dtype=object)
 
@@ -155,7 +153,7 @@ def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
     columns = list(names) if names is not None else _heading_names(heading, separator)
     if len(set(columns)) != len(columns):
         twice = sorted({name for name in columns if columns.count(name) > 1})
-        raise SessionError(path, f"column {', '.join(map(repr, twice))} stands twice", "each column once")
+        raise SessionError(path, f"column {', '.join(map(repr, twice))} appears twice", "each column once")
     if not body.strip():
         raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
     if separator == " ":

@@ -12,10 +12,10 @@ accelerometer      m/s^2                      g, with the opposite sign: times -
 gyroscope          rad/s, as read, then the   rad/s, as read
                    system's bias: taken off
 magnetometer       uT, the same               uT, as read (offsets of hundreds of uT)
-own attitude       rotation-vector: x y z w   attitude: w x y z, heading counts from somewhere
+own attitude       rotation-vector: x y z w   attitude: w x y z, zero of heading unknown
 =================  =========================  ===========================================================
 
-The truth, ``qualisys/<recording>.mat`` two folders up, is optical: frame k stands k / rate - alignment after the log
+The truth, ``qualisys/<recording>.mat`` two folders up, is optical: frame k is taken k / rate - alignment after the log
 began, on the phone's clock; ``timeAlignment.txt`` holds the alignment. Attitude and position are those of the marker
 body, a few degrees and centimetres from the phone's.
 """
@@ -29,18 +29,18 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.timebase import interpolate, nearest, ns_from_seconds, ns_from_text, seconds_since
 from smartnav_graph.readers.matlab import read_mat
-from smartnav_graph.readers.source import Columns, Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, vector_columns
 from smartnav_graph.readers.text import first_lines, read_bytes, read_text
 from smartnav_graph.session.session import Device, Session
 
 NAME = "tyrex"
 GRAVITY = 9.8056  # m/s^2, normal gravity at the hall near Grenoble (45.22 deg north, 250 m)
-SAME_STAMP_NS = 10_000  # stamps closer than this are one: what they are apart moves no reading
+SAME_STAMP_NS = 10_000  # stamps closer than this count as one: readings change less in between than they are resolved
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ _BIAS = ("bias_x", "bias_y", "bias_z")
 
 def _file(folder: Path, name: str) -> Path | None:
     """The plain or gzip-ed text file of a sensor."""
-    there = (folder / f"{name}.txt", folder / f"{name}.txt.gz")
-    return next((file for file in there if file.is_file()), None)
+    files = (folder / f"{name}.txt", folder / f"{name}.txt.gz")
+    return next((file for file in files if file.is_file()), None)
 
 
 def _system(folder: Path) -> System | None:
@@ -103,7 +103,10 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     truth = folder.absolute().parent.parent / "qualisys" / f"{folder.absolute().name}.mat"
     if truth.is_file():
         columns, lost = _truth(truth, folder, system)
-        tables["reference"] = (truth, columns | _own_attitude(folder, system, columns["t_ns"]))
+        tables["reference"] = (
+            truth,
+            columns | _own_attitude(folder, system, np.asarray(columns["t_ns"], dtype=np.int64)),
+        )
         dropped |= {"reference": {"of frames without markers dropped": lost}} if lost else {}
     session = build_session(
         tables,
@@ -126,7 +129,7 @@ def _required(folder: Path, name: str) -> Path:
 def _vectors(folder: Path, name: str, biased: bool) -> tuple[Times, Floats, Floats | None]:
     """Stamps (n,), readings (n, 3) less the system's first bias, and its biases (n, 3), None where none are written.
 
-    The first for all rows: a bias that the system revises on the way would put a step into the readings.
+    The first for all rows: a bias that the system changes during the recording would be a step in the readings.
     """
     axes = ("x", "y", "z")
     table = read_text(_required(folder, name), names=("t", *axes, *(_BIAS if biased else ())))
@@ -135,7 +138,7 @@ def _vectors(folder: Path, name: str, biased: bool) -> tuple[Times, Floats, Floa
     return table.times("t"), rows if bias is None else rows - bias[0], bias
 
 
-def _imu(folder: Path, system: System) -> tuple[Columns, dict[str, dict[str, int]]]:
+def _imu(folder: Path, system: System) -> tuple[Table, dict[str, dict[str, int]]]:
     """Columns of both sensors on the gyro's stamps, and what that did to the rows."""
     t_ns, gyro, bias = _vectors(folder, "gyroscope", system.bias)
     at_ns, accel, _ = _vectors(folder, "accelerometer", False)
@@ -153,8 +156,8 @@ def _imu(folder: Path, system: System) -> tuple[Columns, dict[str, dict[str, int
     columns = {"t_ns": t_ns} | vector_columns("gyro_{}_rad_s", gyro[both])
     columns |= vector_columns("accel_{}_m_s2", system.accel_unit * interpolate(t_ns, at_ns, accel))
     columns |= {} if bias is None else vector_columns("system_bias_{}_rad_s", bias[both])
-    told = {reason: count for reason, count in counts.items() if count}
-    return columns, {"imu": told} if told else {}
+    changes = {reason: count for reason, count in counts.items() if count}
+    return columns, {"imu": changes} if changes else {}
 
 
 def _start_ns(folder: Path, system: System) -> int:
@@ -177,7 +180,7 @@ def _device(folder: Path) -> str:
     return " ".join(word[1].strip() for word in words if word) or "iPhone"
 
 
-def _truth(path: Path, folder: Path, system: System) -> tuple[Columns, int]:
+def _truth(path: Path, folder: Path, system: System) -> tuple[Table, int]:
     """Columns of the optical frames on the phone's clock, and how many without markers were left out."""
     positions, rotations, rate = _rigid_body(path)
     aligned = _number(folder / "timeAlignment.txt", r"(\S+)", "t_truth - t_phone, seconds")
@@ -206,11 +209,11 @@ def _rigid_body(path: Path) -> tuple[Floats, Floats, float]:
     return positions, rotations, rate
 
 
-def _quaternion_columns(template: str, rotations: Rotation) -> Columns:
+def _quaternion_columns(template: str, rotations: Rotation) -> Table:
     return vector_columns(template, rotations.as_quat(canonical=True)[:, [3, 0, 1, 2]], "wxyz")
 
 
-def _own_attitude(folder: Path, system: System, t_ns: Times) -> Columns:
+def _own_attitude(folder: Path, system: System, t_ns: Times) -> Table:
     """The system's own attitude at the frames, kept beside the truth for comparison; not a number outside its span."""
     file = _file(folder, system.attitude)
     if file is None:

@@ -68,7 +68,7 @@ def test_empty_cells_become_nan_but_no_integers(tmp_path):
         (b"", ("has no rows",)),
         (b"t,x\n", ("has no rows", "expected at least one row")),
         (b"t,x\n1,2\n3\n", ("no table of 2 columns", "Expected 2 columns, got 1: 3")),
-        (b"t,x,x\n1,2,3\n", ("column 'x' stands twice",)),
+        (b"t,x,x\n1,2,3\n", ("column 'x' appears twice",)),
         (b"t,x\n1,\0\n", ("is no text",)),
         (b"t,x\n1,\xff\xfe\n", ("no table of 2 columns", "invalid UTF8")),
     ],
