@@ -149,7 +149,7 @@ def measure_front_end(folder: Path) -> None:
     import smartnav_graph as sn
     from smartnav_graph.session.calibration.camera import Camera
     from smartnav_graph.session.streams import Images
-    from smartnav_graph.vision.front_end import FrontEndConfig, find
+    from smartnav_graph.vision.front_end import FrontEndConfig, run_front_end
 
     files = np.array(sorted(file.name for file in folder.glob("*.png")), dtype=object)
     centre = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
@@ -158,7 +158,7 @@ def measure_front_end(folder: Path) -> None:
     images = Images(t_ns=ids * 250_000_000, image_id=ids, file=files, camera=names)
     session = sn.Session(images=images, pictures=folder, calibration=sn.Calibration(cameras={"cam0": camera}))
     cpu, begin = time.process_time(), time.perf_counter()
-    report = find(session, FrontEndConfig(spans=(1,))).report
+    report = run_front_end(session, FrontEndConfig(spans=(1,))).report
     seconds = time.perf_counter() - begin
     told = {"pairs_per_s": round(report.pairs / seconds, 1), "cpu_s": round(time.process_time() - cpu, 4)}
     keys = ("pairs", "matches", "ms_picture", "ms_pair")

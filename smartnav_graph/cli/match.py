@@ -25,7 +25,7 @@ from smartnav_graph.vision import features as kinds
 from smartnav_graph.vision import match_file, match_store
 from smartnav_graph.vision.benchmark import Published, Score
 from smartnav_graph.vision.front_end import FrontEndConfig
-from smartnav_graph.vision.map import SOURCE, Known, own_fixes, pose_fixes
+from smartnav_graph.vision.map import SOURCE, KnownPositions, map_pose_fixes, own_fixes
 
 FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 
@@ -117,7 +117,7 @@ class Match(Command):
         if self.reference is not None:
             session = session.replace(reference=load_reference(self.reference))
         with progress(self.quiet) as show:
-            found = scores.compare(session, asked, config, workers=self.workers, progress=show)
+            found = scores.compare_features(session, asked, config, workers=self.workers, progress=show)
         if self.json:
             self._print_json([one.to_dict() for one in found])
         else:
@@ -126,13 +126,13 @@ class Match(Command):
     def _from_file(self, path: Path) -> None:
         folder = Path(self.session)
         session = session_folder.load(folder)
-        match_store.refuse_others(folder, "matches", self.force)
+        match_store.refuse_existing_stream(folder, "matches", self.force)
         name, camera = self._one_camera(session)
-        rows = match_file.read(path)
+        rows = match_file.read_match_file(path)
         assert session.images is not None  # the camera took some
         matches, lost = match_file.to_matches(rows, session.images, name, camera)
         report = {"from_file": str(path), "rows": len(rows.t0_ns), "matches": len(matches), "rows_without_images": lost}
-        match_store.keep(folder, matches, {"from_file": path.name, "camera": name}, report)
+        match_store.store(folder, matches, {"from_file": path.name, "camera": name}, report)
         if self.json:
             self._print_json(report)
             return
@@ -146,7 +146,7 @@ class Match(Command):
             raise SessionError(self.session, "has no matches", "matches.parquet", "make them with `smartnav match`")
         mine = session.images.image_id[session.images.camera == name]
         matches = session.matches.take(match_file.of_images(session.matches, mine))
-        match_file.write(matches, path, camera, force=self.force)
+        match_file.write_match_file(matches, path, camera, force=self.force)
         if self.json:
             self._print_json({"to_file": str(path), "matches": len(matches)})
         else:
@@ -155,13 +155,13 @@ class Match(Command):
     def _map(self, path: Path) -> None:
         folder = Path(self.session)
         session = session_folder.load(folder)
-        match_store.refuse_others(folder, "pose_fixes", self.force)
+        match_store.refuse_existing_stream(folder, "pose_fixes", self.force)
         refuse_foreign_fixes(folder, session)
         known = own_fixes(session) if self.known is None else self._known(self.known, session)
-        found = pose_fixes(path, session, known)
+        found = map_pose_fixes(path, session, known)
         told = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": found.similarity.sigma}
-        told["turn_sigma_deg"] = float(np.degrees(found.similarity.turn_sigma).max())
-        match_store.keep(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
+        told["turn_sigma_deg"] = float(np.degrees(found.similarity.rotation_sigma).max())
+        match_store.store(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
         if self.json:
             self._print_json(told)
             return
@@ -169,13 +169,13 @@ class Match(Command):
         print(f"pose fixes: {folder / 'pose_fixes.parquet'}")
 
     @staticmethod
-    def _known(path: Path, session: Session) -> Known:
+    def _known(path: Path, session: Session) -> KnownPositions:
         """Positions of a run in the session's frame."""
         run = read_run(path)
         if run.solution.origin != session.origin:
             found = f"has the origin {run.solution.origin}"
             raise SessionError(path, found, f"that of the session, {session.origin}", "smooth this session")
-        return Known(run.solution.t_ns, run.solution.nav_t_body)
+        return KnownPositions(run.solution.t_ns, run.solution.nav_t_body)
 
     def _one_camera(self, session: Session) -> tuple[str, Camera]:
         """The camera named, or the only one that took images."""
@@ -195,7 +195,7 @@ class Match(Command):
             numbers = tuple(int(part) for part in names(text))
         except ValueError as error:
             raise ConfigError("--spans", repr(text), "whole numbers separated by commas, as 1,2,4") from error
-        return FrontEndConfig(features, self.policy, self.count, 0.8, numbers, self.longest, rate_hz)
+        return FrontEndConfig(features, self.policy, self.count, numbers, self.longest, rate_hz)
 
     def _print_json(self, value: Any) -> None:
         print(json.dumps(plain(value), allow_nan=False))

@@ -1,15 +1,15 @@
-"""How good features are, over a session whose camera poses are known: the table of the SmartNav thesis, and ours.
+"""Quality of features over a session with known camera poses: the table of the SmartNav thesis, and ours.
 
-A match is true when it misses the epipolar geometry of the reference by at most `TOLERANCE_PX` (Sampson distance).
-Where the baseline is so short that a point `DEPTH_M` away would hardly move, that test accepts anything along a line of
-no meaning: there the match must lie where the rotation alone puts it.
+A match is true if its Sampson distance from the epipolar geometry of the reference is at most `TOLERANCE_PX`. If the
+baseline is so short that a point `DEPTH_M` away moves by less, the epipolar line has no meaning: then the match is
+compared with its prediction by the rotation alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Matches, Reference
 from smartnav_graph.vision.epipolar import rays, sampson
-from smartnav_graph.vision.front_end import FrontEndConfig, find
+from smartnav_graph.vision.front_end import FrontEndConfig, run_front_end
 
 TOLERANCE_PX = 1.5
 DEPTH_M = 3.0
@@ -73,8 +73,8 @@ class Score:
     ms_pair: float
     skipped: Mapping[str, int]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, the thesis' row beside them."""
+    def to_dict(self) -> dict[str, object]:
+        """Plain values, with the row of the thesis."""
         published = THESIS.get(self.features)
         return asdict(self) | {"thesis": None if published is None else published._asdict()}
 
@@ -123,7 +123,7 @@ def _poses(reference: Reference, t_ns: NDArray[np.int64]) -> tuple[Floats, Float
 
 
 def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) -> tuple[Mask, Mask]:
-    """Which matches agree with known poses, and which of them were judged by the rotation alone.
+    """Which matches agree with known poses, and which of them were tested by the rotation alone.
 
     Parameters
     ----------
@@ -134,27 +134,27 @@ def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) 
     safe = np.where(weak[:, None], [0.0, 0.0, 1.0], t)
     epipolar = np.abs(sampson(R, safe, x0[:, None], x1[:, None]).residual[:, 0])
     ahead = rotate(R, rays(x1))
-    moved = ahead[:, :2] / np.where(np.abs(ahead[:, 2:]) > 1e-9, ahead[:, 2:], np.nan)
-    turned = np.linalg.norm(moved - x0, axis=1)
-    return np.where(weak, turned, epipolar) * focal_px <= TOLERANCE_PX, weak
+    predicted = ahead[:, :2] / np.where(np.abs(ahead[:, 2:]) > 1e-9, ahead[:, 2:], np.nan)
+    error = np.linalg.norm(predicted - x0, axis=1)
+    return np.where(weak, error, epipolar) * focal_px <= TOLERANCE_PX, weak
 
 
-def score(session: Session, config: FrontEndConfig, *, workers: int = 0, progress: Progress = silent) -> Score:
+def score_features(session: Session, config: FrontEndConfig, *, workers: int = 0, progress: Progress = silent) -> Score:
     """Match the session's pictures and compare with its reference.
 
     Raises
     ------
     ConfigError
-        Tracks are asked for.
+        The features are tracks.
     SessionError
-        As `CameraPoses.at` and `front_end.find`; or no pair has a reference.
+        As `CameraPoses.at` and `front_end.run_front_end`; or no pair has a reference.
     """
     if config.tracks:
         raise ConfigError("--features", f"{config.features} in a benchmark of descriptors", "detector and descriptor")
     CameraPoses.at(session, *_any_camera(session))  # before the work is done
-    found = find(session, config, workers=workers, progress=progress)
+    found = run_front_end(session, config, workers=workers, progress=progress)
     assert found.matches is not None
-    good, weak, known = _judged(session, found.matches)
+    good, weak, known = _classified(session, found.matches)
     pair = _pair_numbers(found.matches)
     scored = np.unique(pair[known])
     if not len(scored):
@@ -191,8 +191,8 @@ def _any_camera(session: Session) -> tuple[str, NDArray[np.int64]]:
     return there[0], session.images.t_ns[:1]
 
 
-def _judged(session: Session, matches: Matches) -> tuple[Mask, Mask, Mask]:
-    """Masks (m,): true, judged by rotation alone, with a reference."""
+def _classified(session: Session, matches: Matches) -> tuple[Mask, Mask, Mask]:
+    """Masks (m,): true, tested by rotation alone, with a reference."""
     assert session.images is not None and session.calibration is not None
     names = dict(zip(session.images.image_id.tolist(), session.images.camera.tolist(), strict=True))
     camera = np.array([names[i] for i in matches.image_id_0.tolist()], dtype=object)
@@ -213,7 +213,7 @@ def _pair_numbers(matches: Matches) -> NDArray[np.intp]:
     return np.asarray(np.unique(both, axis=0, return_inverse=True)[1]).ravel()
 
 
-def compare(
+def compare_features(
     session: Session,
     names: Sequence[str],
     config: FrontEndConfig,
@@ -221,6 +221,8 @@ def compare(
     workers: int = 0,
     progress: Progress = silent,
 ) -> list[Score]:
-    """`score` of several kinds of features, otherwise alike."""
+    """`score_features` of several kinds of features, with the same options otherwise."""
     kinds = {name: replace(config, features=name) for name in names}
-    return [score(session, kind, workers=workers, progress=under(name, progress)) for name, kind in kinds.items()]
+    return [
+        score_features(session, kind, workers=workers, progress=under(name, progress)) for name, kind in kinds.items()
+    ]

@@ -1,7 +1,7 @@
-"""Pictures of a session -> matched points of pairs, or tracks: undistorted normalised coordinates.
+"""Front end: pictures of a session -> matches of pairs, or tracks, in undistorted normalised coordinates.
 
-Pictures are opened, judged and searched for points side by side on all processors (OpenCV leaves Python's lock while it
-works, so that threads serve); the order of the results is that of the pictures, whatever their number.
+Pictures are opened, checked and searched for points in parallel on all processors (OpenCV releases Python's lock, so
+threads suffice); the order of the results is that of the pictures for any number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from smartnav_graph.session.streams import Matches, Tracks
 from smartnav_graph.vision import features, images, matching
 from smartnav_graph.vision.features import Features
 from smartnav_graph.vision.front_end_report import FrontEndReport
-from smartnav_graph.vision.images import Look, Picture
+from smartnav_graph.vision.images import OpenedPicture, Picture
 from smartnav_graph.vision.matching import Pairing
 from smartnav_graph.vision.parallel import ordered, threads
 from smartnav_graph.vision.tracking import Gyro, Tracker
@@ -39,11 +39,10 @@ RATE_HZ = 4.0
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    """What to look for, and in which pairs.
+    """Kind and number of features, and which pairs are matched.
 
     features : ``klt`` for tracks, else one of `features.KINDS`, for matches; policy : one of `matching.POLICIES`
     count : points of a picture at most; 0 is 1500, or 300 tracks
-    ratio : of the ratio test
     spans : pictures between the two of a pair; neighbours are always matched, wider pairs up to `longest_s` apart
     rate_hz : pictures a second at most, 0 for all; None is 4 for matches, all for tracks
     """
@@ -51,7 +50,6 @@ class FrontEndConfig:
     features: str = "orb"
     policy: str = "ratio"
     count: int = 0
-    ratio: float = 0.8
     spans: tuple[int, ...] = (1, 2, 4, 8)
     longest_s: float = 2.0
     rate_hz: float | None = None
@@ -69,8 +67,6 @@ class FrontEndConfig:
         for option, value in numbers.items():
             if not (math.isfinite(value) and value >= 0):
                 raise ConfigError(option, f"{value}", "a number >= 0")
-        if not 0 < self.ratio <= 1:
-            raise ConfigError("--ratio", f"{self.ratio}", "more than 0, at most 1")
 
     @property
     def tracks(self) -> bool:
@@ -89,8 +85,8 @@ class FrontEndConfig:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Matches or tracks, and what became of the pictures; `computed` is False where they were read again."""
+class FrontEndResult:
+    """Matches or tracks, and the report on the pictures; `computed` is False if they were read from the session."""
 
     matches: Matches | None
     tracks: Tracks | None
@@ -98,16 +94,16 @@ class Found:
     computed: bool = True
 
 
-def find(
+def run_front_end(
     session: Session, config: FrontEndConfig | None = None, *, workers: int = 0, progress: Progress = silent
-) -> Found:
+) -> FrontEndResult:
     """Matches or tracks of a session's pictures.
 
     Parameters
     ----------
-    session : with images and calibrated cameras; the gyroscope, where there is one, leads tracks
-    workers : pictures at once; 0 for as many as there are processors
-    progress : told stage, done, total
+    session : with images and calibrated cameras; tracks are predicted with the gyroscope, if there is one
+    workers : number of threads; 0: one a processor
+    progress : called with stage, done, total
 
     Raises
     ------
@@ -121,16 +117,16 @@ def find(
         features.require(config.features)
     begin = time.perf_counter()
     job = _Job(session, config, progress)
-    with threads(workers) as pool:
-        found = job.tracks(pool) if config.tracks else job.matches(pool)
+    with threads(workers) as executor:
+        found = job.tracks(executor) if config.tracks else job.matches(executor)
     return replace(found, report=replace(found.report, seconds=round(time.perf_counter() - begin, 3)))
 
 
 class _Points(NamedTuple):
-    """A picture searched: its points, where it is good by itself, and the processor time that took, s."""
+    """A picture with its points, if it is usable, and the processor time, s."""
 
     picture: Picture
-    seen: Look
+    seen: OpenedPicture
     points: Features | None
     cpu_s: float
 
@@ -145,7 +141,7 @@ class _Pair(NamedTuple):
 
 @dataclass
 class _Job:
-    """One run over the pictures of a session."""
+    """One run of the front end."""
 
     session: Session
     config: FrontEndConfig
@@ -156,19 +152,19 @@ class _Job:
 
     def __post_init__(self) -> None:
         self.listed = images.pictures(self.session)
-        there = [picture for picture in self.listed if picture.path.is_file()]
+        present = [picture for picture in self.listed if picture.path.is_file()]
         self.skipped += [(images.MISSING, picture.file) for picture in self.listed if not picture.path.is_file()]
-        self.chosen = images.thinned(there, self.config.rate)
+        self.selected = images.limit_rate(present, self.config.rate)
         calibration = self.session.calibration
         self.cameras: Mapping[str, Camera] = {} if calibration is None else calibration.cameras
-        self.thinned = len(there) - len(self.chosen)
-        self.judge = images.Judge()
+        self.thinned = len(present) - len(self.selected)
+        self.checker = images.PictureChecker()
 
-    def judged(self, found: Iterator[_Points]) -> Iterator[_Points]:
-        """The good ones of the pictures; the others are noted."""
+    def checked(self, found: Iterator[_Points]) -> Iterator[_Points]:
+        """The usable pictures; the others are added to `skipped`."""
         for done, one in enumerate(found, 1):
-            fault = self.judge.fault(one.picture, one.seen)
-            self.progress("pictures", done, len(self.chosen))
+            fault = self.checker.fault(one.picture, one.seen)
+            self.progress("pictures", done, len(self.selected))
             self.cpu_s += one.cpu_s
             if fault:
                 self.skipped.append((fault, one.picture.file))
@@ -176,33 +172,33 @@ class _Job:
             self.used.append(one.picture)
             yield one
         if not self.used:
-            raise self._nothing("no picture can be used")
+            raise self._no_result("no picture can be used")
 
-    def searched(self, picture: Picture) -> _Points:
-        """Points of a picture; its pixels are not kept."""
+    def with_points(self, picture: Picture) -> _Points:
+        """Points of a picture; its pixels are dropped."""
         camera = self.cameras.get(picture.camera)
-        seen = images.look(picture, camera)
+        seen = images.open_picture(picture, camera)
         if seen.gray is None or camera is None:
             return _Points(picture, seen, None, 0.0)
         begin = time.thread_time()
         points = features.extract(seen.gray, camera, self.config.features, self.config.points)
         return _Points(picture, replace(seen, gray=None), points, time.thread_time() - begin)
 
-    def matches(self, pool: Executor) -> Found:
-        """Matches of the pairs that the spans ask for."""
-        under_way: list[Future[_Pair]] = []
+    def matches(self, executor: Executor) -> FrontEndResult:
+        """Matches of the pairs given by the spans."""
+        pending: list[Future[_Pair]] = []
         recent: dict[str, deque[tuple[Picture, Features]]] = {}
-        for picture, _, points, _ in self.judged(ordered(pool, self.searched, self.chosen)):
+        for picture, _, points, _ in self.checked(ordered(executor, self.with_points, self.selected)):
             assert points is not None  # those without were skipped
             line = recent.setdefault(picture.camera, deque(maxlen=max(self.config.spans)))
             for span in self.config.spans:
                 if span <= len(line) and self._near(line[-span][0], picture, span):
-                    under_way.append(pool.submit(self._paired, *line[-span], picture, points))
+                    pending.append(executor.submit(self._paired, *line[-span], picture, points))
             line.append((picture, points))
-        found = [future.result() for future in under_way]
+        found = [future.result() for future in pending]
         counts = [len(pair.pairing.first) for pair in found]
         if not sum(counts):
-            raise self._nothing(f"no match in {len(found)} pairs of pictures")
+            raise self._no_result(f"no match in {len(found)} pairs of pictures")
         report = replace(
             self._report(),
             pairs=len(found),
@@ -211,35 +207,35 @@ class _Job:
             median_matches=float(np.median(counts)),
             ms_pair=round(1e3 * sum(pair.cpu_s for pair in found) / len(found), 3),
         )
-        return Found(_as_matches(found), None, report)
+        return FrontEndResult(_as_matches(found), None, report)
 
     def _near(self, first: Picture, second: Picture, span: int) -> bool:
         return span == 1 or second.t_ns - first.t_ns <= self.config.longest_s * NS
 
     def _paired(self, first: Picture, one: Features, second: Picture, other: Features) -> _Pair:
         begin = time.thread_time()
-        pairing = matching.pair(one.descriptors, other.descriptors, self.config.policy, self.config.ratio)
+        pairing = matching.pair(one.descriptors, other.descriptors, self.config.policy)
         return _Pair(first, second, pairing, (one, other), time.thread_time() - begin)
 
-    def tracks(self, pool: Executor) -> Found:
+    def tracks(self, executor: Executor) -> FrontEndResult:
         """Corners followed through the pictures of each camera."""
         imu = self.session.imu
         gyro = None if imu is None or len(imu) < 2 else Gyro.of(imu)
         ids = itertools.count()
         trackers: dict[str, Tracker] = {}
         seen: list[tuple[Picture, NDArray[np.int64], NDArray[np.float64]]] = []
-        for picture, look, _, _ in self.judged(ordered(pool, self._opened, self.chosen)):
-            assert look.gray is not None  # those without were skipped
+        for picture, opened, _, _ in self.checked(ordered(executor, self._opened, self.selected)):
+            assert opened.gray is not None  # those without were skipped
             if picture.camera not in trackers:
                 body_R_cam = np.array(self.session.mount(picture.camera).body_R)
                 camera = self.cameras[picture.camera]
                 trackers[picture.camera] = Tracker(camera, body_R_cam, gyro, self.config.points, ids)
             begin = time.thread_time()
-            seen.append((picture, *trackers[picture.camera].step(look.gray, picture.t_ns)))
+            seen.append((picture, *trackers[picture.camera].step(opened.gray, picture.t_ns)))
             self.cpu_s += time.thread_time() - begin
         stream, length = _as_tracks(seen, self.cameras)
         if not len(stream):
-            raise self._nothing("no corner was found again")
+            raise self._no_result("no corner was found again")
         again = length[length > 1]
         report = replace(
             self._report(),
@@ -248,10 +244,10 @@ class _Job:
             lost_at_once=int((length == 1).sum()),
             blind=sum(tracker.blind for tracker in trackers.values()),
         )
-        return Found(None, stream, report)
+        return FrontEndResult(None, stream, report)
 
     def _opened(self, picture: Picture) -> _Points:
-        return _Points(picture, images.look(picture, self.cameras.get(picture.camera)), None, 0.0)
+        return _Points(picture, images.open_picture(picture, self.cameras.get(picture.camera)), None, 0.0)
 
     def _report(self) -> FrontEndReport:
         reasons = [reason for reason, _ in self.skipped]
@@ -267,10 +263,10 @@ class _Job:
             ms_picture=round(1e3 * self.cpu_s / max(len(self.used), 1), 3),
         )
 
-    def _nothing(self, found: str) -> SessionError:
-        told = f"{found} of {len(self.listed)}; skipped: {self._report().left_out}"
+    def _no_result(self, found: str) -> SessionError:
+        fault = f"{found} of {len(self.listed)}; skipped: {self._report().left_out}"
         remedy = "give sharp pictures with texture, and [cameras] in calibration.toml"
-        return SessionError(self.session.path or "session", told, "pictures of a calibrated camera", remedy)
+        return SessionError(self.session.path or "session", fault, "pictures of a calibrated camera", remedy)
 
 
 def _as_matches(found: list[_Pair]) -> Matches:
@@ -295,7 +291,7 @@ def _as_matches(found: list[_Pair]) -> Matches:
 def _as_tracks(
     seen: list[tuple[Picture, NDArray[np.int64], NDArray[np.float64]]], cameras: Mapping[str, Camera]
 ) -> tuple[Tracks, NDArray[np.intp]]:
-    """One row an observation of corners seen twice at least; how often (n,) each corner was seen."""
+    """One row an observation of corners seen at least twice; number (n,) of observations of each corner."""
     counts = [len(ids) for _, ids, _ in seen]
     track = np.concatenate([ids for _, ids, _ in seen])
     stream = Tracks(
@@ -309,8 +305,8 @@ def _as_tracks(
     return stream.take(length[track] > 1), length
 
 
-def asked(config: FrontEndConfig) -> dict[str, Any]:
+def result_options(config: FrontEndConfig) -> dict[str, object]:
     """The options that the result depends on, as plain values."""
-    told = asdict(config) | {"count": config.points, "rate_hz": config.rate, "spans": list(config.spans)}
-    unused = ("policy", "ratio", "spans", "longest_s") if config.tracks else ()
-    return {name: value for name, value in told.items() if name not in unused}
+    options = asdict(config) | {"count": config.points, "rate_hz": config.rate, "spans": list(config.spans)}
+    unused = ("policy", "spans", "longest_s") if config.tracks else ()
+    return {name: value for name, value in options.items() if name not in unused}

@@ -1,4 +1,4 @@
-"""What became of the pictures of a session."""
+"""Report of the front end on the pictures of a session."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class FrontEndReport:
-    """What became of the pictures.
+    """Counts of pictures, pairs, matches and tracks.
 
     pictures : of the session; thinned : left out to keep the rate; used : the rest without the skipped, which are
     counted by reason, `first` naming a file of each; longest_break_s : between used pictures
     pairs, empty_pairs (without a match), matches, median_matches of a pair; tracks, median_track_length in pictures,
     lost_at_once (corners never found again), blind (steps that the gyroscope did not predict)
-    ms_picture, ms_pair : processor time of points and descriptors, and of matching; seconds : of it all
+    ms_picture, ms_pair : processor time of points and descriptors, and of matching; seconds : total
     """
 
     features: str

@@ -1,4 +1,4 @@
-"""Pictures of a session: opened, and looked at before anything is measured in them.
+"""Pictures of a session: opened and checked.
 
 A picture is left out, with the reason, when its file is missing or broken, its camera is not calibrated or calibrated
 at another size, when it is dark, blurred beyond the rest of the recording, or the same as the one before it.
@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +32,9 @@ BLURRED = "blurred"
 REPEATED = "repeated"
 REASONS = (MISSING, BROKEN, UNCALIBRATED, RESIZED, DARK, BLURRED, REPEATED)
 
-# Grey levels between the darkest and the brightest hundredth: less is noise, a covered lens or night.
+# Least difference of grey levels between the 1st and the 99th percentile: less is noise, a covered lens or night.
 LEAST_CONTRAST = 16.0
-# A picture half as sharp as is usual is smeared by about a thirtieth of its width.
+# Least sharpness over the usual one: motion blur of about a thirtieth of the width.
 LEAST_SHARPNESS = 0.5
 USUAL_OF, USUAL_FROM = 200, 5  # pictures
 _SMALL_PX = 400
@@ -43,7 +42,7 @@ _SMALL_PX = 400
 
 @dataclass(frozen=True)
 class Picture:
-    """One row of the images: where its file should be."""
+    """One row of the images, with the path of its file."""
 
     image_id: int
     t_ns: int
@@ -52,7 +51,7 @@ class Picture:
     path: Path
 
     def fingerprint(self) -> bytes:
-        """Hash of the file's bytes; empty where there is none."""
+        """Hash of the file's bytes; empty if there is no file."""
         try:
             return hashlib.blake2b(self.path.read_bytes(), digest_size=16).digest()
         except OSError:
@@ -60,8 +59,8 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Look:
-    """A picture opened: `gray` (h, w), absent where a `fault` was seen."""
+class OpenedPicture:
+    """Grey levels `gray` (h, w) of a picture, None with a `fault`; sharpness and fingerprint for later checks."""
 
     gray: Gray | None = None
     fault: str = ""
@@ -88,7 +87,7 @@ def pictures(session: Session) -> list[Picture]:
     return [Picture(int(i), int(t), str(camera), str(file), folder / str(file)) for i, t, camera, file in rows]
 
 
-def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
+def limit_rate(found: list[Picture], rate_hz: float) -> list[Picture]:
     """At most `rate_hz` pictures a second of each camera; all where the rate is 0."""
     if rate_hz <= 0:
         return found
@@ -100,47 +99,47 @@ def thinned(found: list[Picture], rate_hz: float) -> list[Picture]:
     return [found[row] for row in rows]
 
 
-def look(picture: Picture, camera: Camera | None) -> Look:
-    """Open a picture and see what is wrong with it by itself."""
+def open_picture(picture: Picture, camera: Camera | None) -> OpenedPicture:
+    """Open a picture and check it without regard to others."""
     if camera is None:
-        return Look(fault=UNCALIBRATED)
+        return OpenedPicture(fault=UNCALIBRATED)
     try:
         data = picture.path.read_bytes()
     except OSError:
-        return Look(fault=MISSING)
+        return OpenedPicture(fault=MISSING)
     gray = decoded(data)
     if gray is None:
-        return Look(fault=BROKEN)
+        return OpenedPicture(fault=BROKEN)
     if gray.shape != (camera.height, camera.width):
-        return Look(fault=RESIZED)
+        return OpenedPicture(fault=RESIZED)
     low, high = np.percentile(gray[::4, ::4], [1.0, 99.0])
     if high - low < LEAST_CONTRAST:
-        return Look(fault=DARK)
-    return Look(gray, "", sharpness(gray), hashlib.blake2b(gray.tobytes(), digest_size=16).digest())
+        return OpenedPicture(fault=DARK)
+    return OpenedPicture(gray, "", sharpness(gray), hashlib.blake2b(gray.tobytes(), digest_size=16).digest())
 
 
 def decoded(data: bytes) -> Gray | None:
-    """Grey levels (h, w) of the bytes of a picture, as the sensor read it; None where it is cut short or no picture.
+    """Grey levels (h, w) of the bytes of a picture, in the axes of the sensor; None if truncated or not a picture.
 
-    OpenCV refuses truncated data; reading the file itself, it would fill the lost part with grey. How a viewer should
-    turn the picture (EXIF) is not followed: cameras are calibrated and mounted by their sensor's axes.
+    OpenCV refuses truncated data; from a file it would fill the lost part with grey. The orientation for viewers (EXIF)
+    is ignored: cameras are calibrated and mounted by their sensor's axes.
     """
     if not data:
         return None
     import cv2
 
     try:
-        found: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
     return None if found is None else np.asarray(found, dtype=np.uint8)
 
 
 def sharpness(gray: Gray) -> float:
-    """Gradient across the direction in which the picture is smeared most, over its contrast, at a common width.
+    """Gradient in the direction of the strongest blur over the contrast, at a common width.
 
     The root of the smaller eigenvalue of the mean structure tensor over the standard deviation; 0.12 to 0.18 for sharp
-    pictures of rooms, roads and buildings, whatever their noise. Source: Bigün, Granlund (1987), Optimal orientation
+    pictures of indoor and road scenes, with any noise. Source: Bigün, Granlund (1987), Optimal orientation
     detection of linear symmetry, ICCV.
     """
     import cv2
@@ -155,17 +154,17 @@ def sharpness(gray: Gray) -> float:
 
 
 @dataclass
-class Judge:
+class PictureChecker:
     """Compares each picture with those of the same camera before it; one for all cameras, pictures in order."""
 
-    _usual: dict[str, deque[float]] = field(default_factory=dict)
+    _sharpness: dict[str, deque[float]] = field(default_factory=dict)
     _last: dict[str, bytes] = field(default_factory=dict)
 
-    def fault(self, picture: Picture, seen: Look) -> str:
-        """What is wrong with the picture; empty for a good one."""
+    def fault(self, picture: Picture, seen: OpenedPicture) -> str:
+        """Reason to skip the picture; empty for a usable one."""
         if seen.fault:
             return seen.fault
-        usual = self._usual.setdefault(picture.camera, deque(maxlen=USUAL_OF))
+        usual = self._sharpness.setdefault(picture.camera, deque(maxlen=USUAL_OF))
         blurred = len(usual) >= USUAL_FROM and seen.sharpness < LEAST_SHARPNESS * float(np.median(usual))
         usual.append(seen.sharpness)
         repeated = self._last.get(picture.camera) == seen.fingerprint

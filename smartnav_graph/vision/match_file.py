@@ -2,17 +2,16 @@
 
     time0  time1  x0  y0  x1  y1
 
-Times in seconds of the session's clock. Coordinates in micrometres on the sensor, as the picture shows them (with the
-lens's distortion): the origin is the centre of the picture, x points right and y down; the sensor of that camera is
-4.54 mm wide and 3.42 mm high. Columns stand between commas, semicolons, tabs or blanks; lines that begin with # and a
-first line with names are passed over.
+Times in seconds of the session's clock. Coordinates in micrometres on the sensor, with lens distortion: the origin is
+the centre of the picture, x points right and y down; the sensor of that camera is 4.54 mm wide and 3.42 mm high.
+Columns are separated by commas, semicolons, tabs or blanks; lines that begin with # and a first line with names are
+skipped.
 
     x_px = x_um / pitch + (width - 1) / 2,   pitch = 4540 um / width   (the centre of the first pixel is 0)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,34 +27,14 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.streams import Images, Matches
 
 NAMES = ("time0", "time1", "x0", "y0", "x1", "y1")
+SENSOR_UM = np.array([4540.0, 3420.0])  # width, height of the sensitive area
 # Decimal places written: a nanometre, far below the noise of any match.
 PLACES = 3
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """Size of the sensitive area, um; the default is that of the camera of 2012."""
-
-    width_um: float = 4540.0
-    height_um: float = 3420.0
-
-    def pixels(self, xy_um: Floats, camera: Camera) -> Floats:
-        """Pixels (n, 2) of sensor coordinates (n, 2)."""
-        return xy_um / self._pitch(camera) + self._centre(camera)
-
-    def micrometres(self, xy_px: Floats, camera: Camera) -> Floats:
-        """The inverse of `pixels`."""
-        return (xy_px - self._centre(camera)) * self._pitch(camera)
-
-    def _pitch(self, camera: Camera) -> Floats:
-        return np.array([self.width_um / camera.width, self.height_um / camera.height])
-
-    def _centre(self, camera: Camera) -> Floats:
-        return np.array([camera.width - 1, camera.height - 1]) / 2.0
+WITHIN_S = 0.02  # largest difference between the time of a match and that of its image
 
 
 class Rows(NamedTuple):
-    """What a file holds: t0_ns, t1_ns (n,); xy0_um, xy1_um (n, 2) on the sensor."""
+    """Rows of a file: t0_ns, t1_ns (n,); xy0_um, xy1_um (n, 2) on the sensor."""
 
     t0_ns: Times
     t1_ns: Times
@@ -63,7 +42,7 @@ class Rows(NamedTuple):
     xy1_um: Floats
 
 
-def read(path: str | Path, sensor: Sensor | None = None) -> Rows:
+def read_match_file(path: str | Path) -> Rows:
     """The rows of a match file.
 
     Raises
@@ -71,12 +50,12 @@ def read(path: str | Path, sensor: Sensor | None = None) -> Rows:
     SessionError
         Missing or unreadable file, rows of another length, a cell that is no number, a point outside the sensor.
     """
-    path, sensor = Path(path), sensor or Sensor()
+    path = Path(path)
     named = any(line.lower().startswith(NAMES[0]) for line in first_lines(path, 1))
     table = read_text(path, names=None if named else NAMES)
     table.require(NAMES)
     rows = Rows(table.times("time0"), table.times("time1"), table.floats("x0", "y0"), table.floats("x1", "y1"))
-    half = np.array([sensor.width_um, sensor.height_um]) / 2.0
+    half = SENSOR_UM / 2.0
     for label, xy in (("0", rows.xy0_um), ("1", rows.xy1_um)):
         bad = np.argwhere(~(np.abs(xy) <= half))
         if len(bad):
@@ -87,15 +66,12 @@ def read(path: str | Path, sensor: Sensor | None = None) -> Rows:
     return rows
 
 
-def to_matches(
-    rows: Rows, images: Images, name: str, camera: Camera, *, sensor: Sensor | None = None, within_s: float = 0.02
-) -> tuple[Matches, int]:
-    """Matches between the session's images, in undistorted normalised coordinates, and how many rows found none.
+def to_matches(rows: Rows, images: Images, name: str, camera: Camera) -> tuple[Matches, int]:
+    """Matches between the session's images, in undistorted normalised coordinates, and the number of other rows.
 
     Parameters
     ----------
-    images, name : the session's, and which camera's; each time belongs to the nearest of its stamps, at most `within_s`
-        away
+    images, name : those of the session, and the camera; each time belongs to the nearest stamp, at most `WITHIN_S` away
     camera : of that name
 
     Raises
@@ -109,16 +85,16 @@ def to_matches(
     stamps = images.t_ns[mine]
     first, second = nearest(rows.t0_ns, stamps), nearest(rows.t1_ns, stamps)
     apart = np.maximum(np.abs(stamps[first] - rows.t0_ns), np.abs(stamps[second] - rows.t1_ns))
-    good = (apart <= within_s * NS) & (first != second)
+    good = (apart <= WITHIN_S * NS) & (first != second)
     if not good.any():
-        told = [f"{t.min() / NS:.3f} to {t.max() / NS:.3f} s" for t in (rows.t0_ns, stamps)]
-        expected = f"times within {within_s:g} s of two images; those are from {told[1]}"
-        raise SessionError("match file", f"no row belongs to two images; times from {told[0]}", expected)
-    keep = np.flatnonzero(good)
-    keep = keep[np.lexsort((second[keep], first[keep]))]
-    sensor = sensor or Sensor()
-    at = [mine[first[keep]], mine[second[keep]]]
-    xy = [camera.normalised(sensor.pixels(um[keep], camera)) for um in (rows.xy0_um, rows.xy1_um)]
+        spans = [f"{t.min() / NS:.3f} to {t.max() / NS:.3f} s" for t in (rows.t0_ns, stamps)]
+        expected = f"times within {WITHIN_S:g} s of two images; those are from {spans[1]}"
+        raise SessionError("match file", f"no row belongs to two images; times from {spans[0]}", expected)
+    used = np.flatnonzero(good)
+    used = used[np.lexsort((second[used], first[used]))]
+    at = [mine[first[used]], mine[second[used]]]
+    pitch, centre = _pitch_and_centre(camera)
+    xy = [camera.normalised(um[used] / pitch + centre) for um in (rows.xy0_um, rows.xy1_um)]
     matches = Matches(
         t_ns=images.t_ns[at[0]],
         t_1_ns=images.t_ns[at[1]],
@@ -130,14 +106,18 @@ def to_matches(
     return matches, int((~good).sum())
 
 
+def _pitch_and_centre(camera: Camera) -> tuple[Floats, Floats]:
+    """Size of a pixel (2,) um, and pixel coordinates (2,) of the centre of the picture."""
+    size = np.array([camera.width, camera.height])
+    return SENSOR_UM / size, (size - 1) / 2.0
+
+
 def of_images(matches: Matches, image_ids: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which matches (n,) are between two of these images."""
     return np.isin(matches.image_id_0, image_ids) & np.isin(matches.image_id_1, image_ids)
 
 
-def write(
-    matches: Matches, path: str | Path, camera: Camera, *, sensor: Sensor | None = None, force: bool = False
-) -> None:
+def write_match_file(matches: Matches, path: str | Path, camera: Camera, *, force: bool = False) -> None:
     """Write matches of one camera as a match file: times with nine decimal places, coordinates with three.
 
     Raises
@@ -145,8 +125,8 @@ def write(
     SessionError
         The file exists and `force` is not given, or cannot be written.
     """
-    sensor = sensor or Sensor()
-    um = [sensor.micrometres(camera.pixels(xy), camera) for xy in (matches.xy0_n, matches.xy1_n)]
+    pitch, centre = _pitch_and_centre(camera)
+    um = [(camera.pixels(xy) - centre) * pitch for xy in (matches.xy0_n, matches.xy1_n)]
     lines = [f"# {' '.join(NAMES)}: s, um from the picture's centre, x right, y down"]
     for t0, t1, one, other in zip(matches.t_ns.tolist(), matches.t_1_ns.tolist(), *um, strict=True):
         places = " ".join(_fixed(value) for value in (*one, *other))

@@ -1,7 +1,7 @@
-"""Matches and tracks kept in the session folder, with what was asked for and what they were made of.
+"""Matches and tracks stored in the session folder, with their options and inputs.
 
-Beside ``matches.parquet`` (or ``tracks.parquet``) stands a TOML of the same name: the options, a hash of the pictures
-and of the calibration they were read with, a hash of the rows themselves, and the report.
+Beside ``matches.parquet`` (or ``tracks.parquet``) lies a TOML of the same name: the options, a hash of the pictures and
+of the calibration, a hash of the rows, and the report.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.vision import images
-from smartnav_graph.vision.front_end import Found, FrontEndConfig, asked, find
+from smartnav_graph.vision.front_end import FrontEndConfig, FrontEndResult, result_options, run_front_end
 from smartnav_graph.vision.front_end_report import FrontEndReport
 from smartnav_graph.vision.parallel import ordered, threads
 
@@ -37,52 +37,52 @@ def match(
     force: bool = False,
     workers: int = 0,
     progress: Progress = silent,
-) -> Found:
-    """The matches or tracks of a session folder: those it keeps, where they were made alike, else made and kept.
+) -> FrontEndResult:
+    """The matches or tracks of a session folder: the stored ones if made with the same options, else new ones, stored.
 
     Raises
     ------
     SessionError
-        The session keeps others and `force` is not given; or as `front_end.find`.
+        The session holds others and `force` is not given; or as `front_end.run_front_end`.
     """
     folder, config = Path(path), config or FrontEndConfig()
     session = session_folder.load(folder)
     name = "tracks" if config.tracks else "matches"
-    wanted = asked(config) | {"inputs": _inputs(session, config, workers)}
+    wanted = result_options(config) | {"inputs": _inputs(session, config, workers)}
     if (folder / f"{name}.parquet").exists() and not force:
-        report = FrontEndReport(**_kept(folder, name, wanted))
-        return Found(session.matches, session.tracks, report, computed=False)
-    found = find(session, config, workers=workers, progress=progress)
-    keep(folder, found.tracks or found.matches, wanted, asdict(found.report))
+        report = FrontEndReport(**_stored_report(folder, name, wanted))
+        return FrontEndResult(session.matches, session.tracks, report, computed=False)
+    found = run_front_end(session, config, workers=workers, progress=progress)
+    store(folder, found.tracks or found.matches, wanted, asdict(found.report))
     return found
 
 
-def keep(folder: Path, stream: Stream | None, wanted: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-    """Write a stream into the session folder, with where it comes from; what stood there is replaced."""
+def store(folder: Path, stream: Stream | None, wanted: Mapping[str, object], report: Mapping[str, object]) -> None:
+    """Write a stream into the session folder, with its origin; an existing one is replaced."""
     assert stream is not None
     file = folder / f"{stream.NAME}.parquet"
     with replacing(file) as new:
         write_table(stream.columns(), new)
-    told = {"asked": dict(wanted), "rows": _digest(file), "report": dict(report)}
+    content = {"asked": dict(wanted), "rows": _digest(file), "report": dict(report)}
     with replacing(file.with_suffix(".toml")) as new:
-        new.write_text(tomli_w.dumps(told), encoding="utf-8")
+        new.write_text(tomli_w.dumps(content), encoding="utf-8")
 
 
-def refuse_others(folder: Path, name: str, force: bool) -> None:
-    """Raise where the session keeps such a stream already, unless it may be replaced."""
+def refuse_existing_stream(folder: Path, name: str, force: bool) -> None:
+    """Raise if the session has such a stream already, unless it may be replaced."""
     file = folder / f"{name}.parquet"
     if file.exists() and not force:
         raise SessionError(file, "exists already", "a session without it", REMEDY, stream=name)
 
 
-def _kept(folder: Path, name: str, wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """The report of rows that were made as is wanted now."""
+def _stored_report(folder: Path, name: str, wanted: Mapping[str, object]) -> dict[str, Any]:
+    """The report of stored rows, if they were made with the options wanted."""
     file = folder / f"{name}.parquet"
     try:
-        told = tomllib.loads(file.with_suffix(".toml").read_text(encoding="utf-8"))
-        before, rows, report = told["asked"], told["rows"], told["report"]
+        content = tomllib.loads(file.with_suffix(".toml").read_text(encoding="utf-8"))
+        before, rows, report = content["asked"], content["rows"], content["report"]
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError) as error:
-        raise SessionError(file, "does not tell what it was made of", SAME, REMEDY, stream=name) from error
+        raise SessionError(file, "does not say how it was made", SAME, REMEDY, stream=name) from error
     if rows != _digest(file):
         raise SessionError(file, "was changed since it was made", SAME, REMEDY, stream=name)
     other = [key for key, value in wanted.items() if before.get(key) != value]
@@ -91,7 +91,7 @@ def _kept(folder: Path, name: str, wanted: Mapping[str, Any]) -> dict[str, Any]:
     return dict(report)
 
 
-def _difference(before: Mapping[str, Any], wanted: Mapping[str, Any], keys: Sequence[str]) -> str:
+def _difference(before: Mapping[str, object], wanted: Mapping[str, object], keys: Sequence[str]) -> str:
     if "from_file" in before:
         return f"was taken from {before['from_file']}"
     texts = [f"{key} {before.get(key)} (asked for: {wanted[key]})" for key in keys if key != "inputs"]
@@ -99,11 +99,11 @@ def _difference(before: Mapping[str, Any], wanted: Mapping[str, Any], keys: Sequ
 
 
 def _inputs(session: Session, config: FrontEndConfig, workers: int) -> str:
-    """Hash of all that the result depends on beside the options."""
+    """Hash of all inputs of the result besides the options."""
     found = hashlib.blake2b(digest_size=16)
-    with threads(workers) as pool:
-        for picture, told in ordered(pool, lambda one: (one, one.fingerprint()), images.pictures(session)):
-            found.update(f"{picture.image_id} {picture.t_ns} {picture.camera} {picture.file} {told.hex()}\n".encode())
+    with threads(workers) as executor:
+        for picture, digest in ordered(executor, lambda one: (one, one.fingerprint()), images.pictures(session)):
+            found.update(f"{picture.image_id} {picture.t_ns} {picture.camera} {picture.file} {digest.hex()}\n".encode())
     cameras = {} if session.calibration is None else session.calibration.cameras
     found.update(repr(sorted(cameras.items())).encode())
     if config.tracks and session.imu is not None:

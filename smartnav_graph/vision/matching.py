@@ -1,6 +1,6 @@
-"""Matched points of two pictures by their descriptors.
+"""Matches of two pictures by their descriptors.
 
-``ratio``    mutual nearest neighbours whose distance is at most `ratio` times that of the second nearest (Lowe 2004)
+``ratio``    mutual nearest neighbours whose distance is at most `RATIO` times that of the second nearest (Lowe 2004)
 ``thesis``   of the nearest neighbours the 15 best, none farther than three times the smallest distance
 
 Source: Lowe (2004), Distinctive image features from scale-invariant keypoints, IJCV 60(2), 7.1. The other is the rule
@@ -20,12 +20,13 @@ from smartnav_graph.core.errors import ConfigError
 Rows = NDArray[np.intp]
 
 POLICIES = ("ratio", "thesis")
+RATIO = 0.8  # of the ratio test
 THESIS_BEST = 15
 THESIS_TIMES = 3.0
 
 
 class Pairing(NamedTuple):
-    """Rows (m,) of the first and of the second picture that belong together, with a score (m,), smaller is better.
+    """Matched rows (m,) of the first and of the second picture, with a score (m,), smaller is better.
 
     The score of ``ratio`` is the ratio of distances, that of ``thesis`` the distance over the smallest.
     """
@@ -35,7 +36,7 @@ class Pairing(NamedTuple):
     score: Floats
 
 
-def pair(one: NDArray[np.generic], other: NDArray[np.generic], policy: str = "ratio", ratio: float = 0.8) -> Pairing:
+def pair(one: NDArray[np.generic], other: NDArray[np.generic], policy: str = "ratio") -> Pairing:
     """Match descriptors (n, k) and (m, k): bits in bytes (Hamming distance), or floats (Euclidean).
 
     Raises
@@ -51,7 +52,7 @@ def pair(one: NDArray[np.generic], other: NDArray[np.generic], policy: str = "ra
     if policy == "thesis":
         return choose_thesis(distance[:, 0], nearest[:, 0])
     share = distance[:, 0] / np.maximum(distance[:, 1], np.finfo(float).tiny)
-    rows = np.flatnonzero((share <= ratio) & (distance[:, 1] > 0))
+    rows = np.flatnonzero((share <= RATIO) & (distance[:, 1] > 0))
     if not len(rows):
         return Pairing(rows, rows, np.zeros(0))
     columns, back = np.unique(nearest[rows, 0], return_inverse=True)

@@ -65,7 +65,7 @@ def match(folder, *options):
 def test_a_model_holds_the_trajectory(workshop, capsys):
     folder, room = workshop
     assert match(folder) == 1
-    assert "no gnss fixes to lay a map on" in capsys.readouterr().err
+    assert "no gnss fixes to align a map" in capsys.readouterr().err
     assert match(folder, "--known", f"{folder}/without", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["used"] == told["aligned"] == len(room.images) // EVERY and told["unknown"] == 0

@@ -15,7 +15,7 @@ from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import Reference
 from smartnav_graph.vision import benchmark
-from smartnav_graph.vision.benchmark import CameraPoses, score, true_matches
+from smartnav_graph.vision.benchmark import CameraPoses, score_features, true_matches
 from smartnav_graph.vision.front_end import FrontEndConfig
 
 R = Rotation.from_euler("yxz", [6, -3, 10], degrees=True).as_matrix()  # c0_R_c1
@@ -117,43 +117,43 @@ def wall(folder, sign: float = 1.0) -> sn.Session:
 
 def test_the_score_of_a_wall(tmp_path):
     config = FrontEndConfig(count=300, spans=(1,), rate_hz=0.0)
-    found = score(wall(tmp_path / "s"), config)
+    found = score_features(wall(tmp_path / "s"), config)
     assert (found.pairs, found.unscored_pairs, found.rotation_pairs) == (5, 0, 0)
     assert found.true_rate > 0.97 and found.useful_pairs == 1.0
     assert 60 < found.median_true <= found.median_matches <= 300
     assert found.ms_picture > 0 and found.ms_pair > 0
     told = found.to_dict()
     assert told["thesis"] == {"true_rate": 0.8499, "useful_pairs": 0.6111, "seconds": 1.0}
-    wrong = score(wall(tmp_path / "wrong", sign=-1.0), config)
+    wrong = score_features(wall(tmp_path / "wrong", sign=-1.0), config)
     assert wrong.matches == found.matches and wrong.true_rate < 0.5
 
 
 def test_pairs_outside_the_reference_are_told(tmp_path):
     session = wall(tmp_path / "s")
     short = session.replace(reference=session.reference.take(slice(0, 13)))  # 0.6 s
-    found = score(short, FrontEndConfig(count=200, spans=(1,), rate_hz=0.0))
+    found = score_features(short, FrontEndConfig(count=200, spans=(1,), rate_hz=0.0))
     assert (found.pairs, found.unscored_pairs) == (2, 3)
     late = replace(session.reference, t_ns=session.reference.t_ns + 10**12)
     with pytest.raises(SessionError, match="no pair of pictures has a reference"):
-        score(session.replace(reference=late), FrontEndConfig(count=200, spans=(1,)))
+        score_features(session.replace(reference=late), FrontEndConfig(count=200, spans=(1,)))
 
 
 def test_what_a_benchmark_needs(tmp_path):
     session = wall(tmp_path / "s")
     with pytest.raises(SessionError, match="has no reference with attitude"):
-        score(session.replace(reference=None), FrontEndConfig())
+        score_features(session.replace(reference=None), FrontEndConfig())
     with pytest.raises(SessionError, match="no calibrated camera took its images"):
-        score(session.replace(calibration=None), FrontEndConfig())
+        score_features(session.replace(calibration=None), FrontEndConfig())
     with pytest.raises(SessionError, match="has no images"):
-        score(session.replace(images=None), FrontEndConfig())
+        score_features(session.replace(images=None), FrontEndConfig())
     with pytest.raises(ConfigError, match="klt in a benchmark"):
-        score(session, FrontEndConfig(features="klt"))
+        score_features(session, FrontEndConfig(features="klt"))
 
 
 def test_public_recordings(dataset):
     """ORB on neighbours of KITTI odometry 06 and of the Lund door."""
     for name, pairs, true_rate, matches in (("kitti_odometry06", 50, 0.959, 395), ("lund_door", 11, 0.985, 699)):
-        found = score(sn.load(dataset(name)), FrontEndConfig(spans=(1,), rate_hz=0.0))
+        found = score_features(sn.load(dataset(name)), FrontEndConfig(spans=(1,), rate_hz=0.0))
         assert found.pairs == pairs and found.useful_pairs == 1.0
         assert found.true_rate == pytest.approx(true_rate, abs=0.015)
         assert found.median_matches == pytest.approx(matches, rel=0.1)
@@ -164,7 +164,7 @@ def test_standing_still_is_judged_by_rotation(dataset):
     folder = dataset("euroc_v101")
     session = sn.load(folder)
     truth = sn.load_reference(folder / "groundtruth_openvins" / "V1_01_easy.csv")
-    found = score(session.replace(reference=truth), FrontEndConfig(spans=(1,), rate_hz=0.0))
+    found = score_features(session.replace(reference=truth), FrontEndConfig(spans=(1,), rate_hz=0.0))
     assert found.pairs == found.rotation_pairs == 5 and found.skipped == {"missing file": 89}
     assert found.true_rate > 0.8  # the truth's own attitude wavers by a pixel
 
@@ -183,7 +183,9 @@ def test_true_poses_may_stand_beside_the_session(dataset, capsys):
 
 
 def test_the_table_names_what_this_build_lacks(tmp_path, capsys):
-    found = benchmark.compare(wall(tmp_path / "s"), ["orb"], FrontEndConfig(count=200, spans=(1,), rate_hz=0.0))
+    found = benchmark.compare_features(
+        wall(tmp_path / "s"), ["orb"], FrontEndConfig(count=200, spans=(1,), rate_hz=0.0)
+    )
     print_scores(found, all_known=True)
     out = capsys.readouterr().out
     assert "policy ratio, 5 pairs" in out and "84.99%" in out and "97.82%" in out

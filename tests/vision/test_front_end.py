@@ -14,7 +14,7 @@ from smartnav_graph import readers
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import Imu
-from smartnav_graph.vision.front_end import FrontEndConfig, find
+from smartnav_graph.vision.front_end import FrontEndConfig, run_front_end
 from smartnav_graph.vision.parallel import ordered, threads
 
 PLANE = texture(seed=5, size=1200)
@@ -30,7 +30,7 @@ def plain(tmp_path_factory):
 
 
 def test_matches_of_a_plane_agree_with_its_homographies(plain):
-    found = find(plain, FrontEndConfig(count=300, spans=(1, 3)))
+    found = run_front_end(plain, FrontEndConfig(count=300, spans=(1, 3)))
     matches, report = found.matches, found.report
     assert (report.pictures, report.used, report.pairs, report.empty_pairs) == (10, 10, 9 + 7, 0)
     assert report.matches == len(matches) > 16 * 60
@@ -47,28 +47,28 @@ def test_matches_of_a_plane_agree_with_its_homographies(plain):
 
 
 def test_the_number_of_threads_changes_nothing(plain):
-    one, other = (find(plain, FrontEndConfig(count=200), workers=n).matches for n in (1, 3))
+    one, other = (run_front_end(plain, FrontEndConfig(count=200), workers=n).matches for n in (1, 3))
     for name, column in one.columns().items():
         np.testing.assert_array_equal(column, other.columns()[name])
 
 
 def test_neighbours_always_match_and_wider_pairs_within_the_time(plain):
-    matches = find(plain, FrontEndConfig(count=200, spans=(1, 2, 4), longest_s=0.5)).matches
+    matches = run_front_end(plain, FrontEndConfig(count=200, spans=(1, 2, 4), longest_s=0.5)).matches
     spans = np.unique(matches.image_id_1 - matches.image_id_0)
     assert spans.tolist() == [1, 2]
     slow = plain.replace(images=plain.images.take(slice(None, None, 5)))  # 1.25 s apart
-    matches = find(slow, FrontEndConfig(count=200, spans=(1, 2), longest_s=0.5)).matches
+    matches = run_front_end(slow, FrontEndConfig(count=200, spans=(1, 2), longest_s=0.5)).matches
     assert set(zip(matches.image_id_0.tolist(), matches.image_id_1.tolist(), strict=True)) == {(10, 15)}
 
 
 def test_the_rate_thins_and_is_told(plain):
-    report = find(plain, FrontEndConfig(count=200, rate_hz=2.0)).report
+    report = run_front_end(plain, FrontEndConfig(count=200, rate_hz=2.0)).report
     assert (report.used, report.thinned) == (5, 5)
     assert "5 of 10 used, 5 left out to keep the rate; longest break 0.50 s" in report.to_text()
 
 
 def test_the_policy_of_the_thesis_keeps_fifteen(plain):
-    matches = find(plain, FrontEndConfig(count=300, policy="thesis", spans=(1,))).matches
+    matches = run_front_end(plain, FrontEndConfig(count=300, policy="thesis", spans=(1,))).matches
     _, counts = np.unique(matches.image_id_0, return_counts=True)
     assert counts.max() == 15 and len(counts) == 9
     assert matches.score.min() == 1.0 and matches.score.max() <= 3.0
@@ -82,7 +82,7 @@ def test_every_fault_is_skipped_counted_and_told(tmp_path):
     faulty[5] = PICTURES[5][:200]
     faulty[7] = PICTURES[6]
     session = session_of(faulty, tmp_path / "s")
-    report = find(session, FrontEndConfig(count=200, spans=(1,))).report
+    report = run_front_end(session, FrontEndConfig(count=200, spans=(1,))).report
     assert report.skipped == {
         "missing file": 1,
         "broken file": 1,
@@ -100,7 +100,7 @@ def test_a_long_blur_is_skipped(tmp_path):
     kernel = np.eye(41, dtype=np.float32) / 41
     smeared = [cv2.filter2D(picture, -1, kernel) for picture in PICTURES]
     session = session_of([*PICTURES, *smeared[:8], *PICTURES[:2]], tmp_path / "s")
-    report = find(session, FrontEndConfig(count=200, spans=(1,))).report
+    report = run_front_end(session, FrontEndConfig(count=200, spans=(1,))).report
     assert report.skipped == {"blurred": 8}
     assert report.longest_break_s == 9 * 0.25
 
@@ -108,7 +108,7 @@ def test_a_long_blur_is_skipped(tmp_path):
 def test_pictures_of_an_unknown_camera_are_counted(plain):
     names = np.where(np.arange(10) % 2, "cam0", "cam1").astype(object)
     object.__setattr__(images := plain.images.take(slice(None)), "camera", names)
-    report = find(plain.replace(images=images), FrontEndConfig(count=200, spans=(1,))).report
+    report = run_front_end(plain.replace(images=images), FrontEndConfig(count=200, spans=(1,))).report
     assert report.skipped == {"camera without calibration": 5} and report.pairs == 4
 
 
@@ -116,21 +116,23 @@ def test_cameras_are_not_matched_with_each_other(plain):
     names = np.where(np.arange(10) % 2, "cam0", "cam1").astype(object)
     object.__setattr__(images := plain.images.take(slice(None)), "camera", names)
     both = replace(plain.calibration, cameras={"cam0": CAMERA, "cam1": CAMERA})
-    matches = find(plain.replace(images=images, calibration=both), FrontEndConfig(count=200, spans=(1,))).matches
+    matches = run_front_end(
+        plain.replace(images=images, calibration=both), FrontEndConfig(count=200, spans=(1,))
+    ).matches
     assert np.unique(matches.image_id_1 - matches.image_id_0).tolist() == [2]
 
 
 def test_nothing_usable_is_an_error_that_counts(plain, tmp_path):
     with pytest.raises(SessionError) as caught:
-        find(plain.replace(calibration=None))
+        run_front_end(plain.replace(calibration=None))
     for part in ("no picture can be used of 10", "10 camera without calibration (first: 000.png)", "[cameras]"):
         assert part in str(caught.value)
     gone = plain.replace(pictures=tmp_path / "nowhere")
     with pytest.raises(SessionError, match="no picture can be used of 10; skipped: 10 missing file"):
-        find(gone)
+        run_front_end(gone)
     alone = session_of(PICTURES[:1], tmp_path / "alone")
     with pytest.raises(SessionError, match="no match in 0 pairs of pictures of 1"):
-        find(alone)
+        run_front_end(alone)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,6 @@ def test_nothing_usable_is_an_error_that_counts(plain, tmp_path):
         ({"count": -1}, "--count: -1"),
         ({"longest_s": float("nan")}, "--longest: nan"),
         ({"rate_hz": -1.0}, "--rate: -1"),
-        ({"ratio": 0.0}, "--ratio: 0"),
     ],
 )
 def test_options_are_checked(options, message):
@@ -161,7 +162,7 @@ def test_tracks_of_a_turning_camera(tmp_path):
     t_ns = np.arange(301) * 5_000_000
     imu = Imu(t_ns=t_ns, gyro=np.tile(rate, (301, 1)), accel=np.tile([0.0, -9.81, 0.0], (301, 1)))
     session = session_of(pictures, tmp_path / "s", imu=imu, sensors={"cam0": Mount()})
-    found = find(session, FrontEndConfig(features="klt", count=100))
+    found = run_front_end(session, FrontEndConfig(features="klt", count=100))
     tracks, report = found.tracks, found.report
     assert found.matches is None and report.blind == 0 and report.used == 5
     assert len(np.unique(tracks.track_id)) == report.tracks
@@ -176,7 +177,7 @@ def test_tracks_of_a_turning_camera(tmp_path):
         step = turning(turns[k + 1] @ turns[k].T)
         miss.append(np.linalg.norm(moved(step, a.xy_px[ia]) - b.xy_px[ib], axis=1))
     assert np.median(np.concatenate(miss)) < 0.15  # px
-    blind = find(session.replace(imu=None), FrontEndConfig(features="klt", count=100)).report
+    blind = run_front_end(session.replace(imu=None), FrontEndConfig(features="klt", count=100)).report
     assert blind.blind == 4 and blind.lost_at_once > 2 * report.lost_at_once
 
 
@@ -211,13 +212,13 @@ def test_opencv_has_its_threads_back():
     [("kitti_odometry06", 50, 395, 0), ("lund_door", 11, 699, 0), ("euroc_v101", 5, 1080, 89)],
 )
 def test_public_recordings(dataset, name, pairs, median, skipped):
-    report = find(readers.read(dataset(name)), FrontEndConfig(spans=(1,), rate_hz=0.0)).report
+    report = run_front_end(readers.read(dataset(name)), FrontEndConfig(spans=(1,), rate_hz=0.0)).report
     assert (report.pairs, report.empty_pairs, sum(report.skipped.values())) == (pairs, 0, skipped)
     assert report.median_matches == pytest.approx(median, rel=0.1)
 
 
 def test_tracks_of_a_public_recording(dataset):
-    found = find(readers.read(dataset("euroc_v101")), FrontEndConfig(features="klt"))
+    found = run_front_end(readers.read(dataset("euroc_v101")), FrontEndConfig(features="klt"))
     assert found.report.used == 6 and found.report.blind == 0
     assert found.report.tracks == pytest.approx(300, abs=15)
     # it stands still: corners stay within the shiver of the motors

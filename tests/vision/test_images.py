@@ -8,7 +8,7 @@ from scenes2d import CAMERA, centred, jpeg, png, seen, session_of, texture
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision import images
-from smartnav_graph.vision.images import Judge, Look, Picture
+from smartnav_graph.vision.images import OpenedPicture, Picture, PictureChecker
 
 PLANE = texture()
 PICTURE = seen(PLANE, centred(PLANE))
@@ -71,7 +71,7 @@ def picture(tmp_path, content, camera="cam0", number=0) -> Picture:
     ],
 )
 def test_faults_of_one_picture(tmp_path, content, camera, fault):
-    found = images.look(picture(tmp_path, content), camera)
+    found = images.open_picture(picture(tmp_path, content), camera)
     assert found.fault == fault
     assert (found.gray is None) == bool(fault)
 
@@ -94,29 +94,32 @@ def test_sharpness_does_not_depend_on_exposure_or_noise():
 
 
 def test_blur_is_judged_against_the_rest_and_a_picture_twice_is_one_too_many(tmp_path):
-    judge = Judge()
+    judge = PictureChecker()
     where = picture(tmp_path, None)
 
     def faults(*values: float, mark: str = "") -> list[str]:
-        return [judge.fault(where, Look(PICTURE, "", value, f"{mark}{i}".encode())) for i, value in enumerate(values)]
+        return [
+            judge.fault(where, OpenedPicture(PICTURE, "", value, f"{mark}{i}".encode()))
+            for i, value in enumerate(values)
+        ]
 
     assert faults(0.05, 0.15, 0.14, 0.15, 0.15, 0.16) == [""] * 6  # nothing to compare the first with
     assert faults(*[0.05] * 4, mark="b") == [images.BLURRED] * 4
     assert faults(0.15, mark="c") == [""]
-    assert judge.fault(where, Look(PICTURE, "", 0.15, b"c0")) == images.REPEATED
-    assert judge.fault(where, Look(fault=images.DARK)) == images.DARK
+    assert judge.fault(where, OpenedPicture(PICTURE, "", 0.15, b"c0")) == images.REPEATED
+    assert judge.fault(where, OpenedPicture(fault=images.DARK)) == images.DARK
     elsewhere = Picture(9, 0, "cam1", "", tmp_path)
-    assert judge.fault(elsewhere, Look(PICTURE, "", 0.02, b"c0")) == ""  # another camera
+    assert judge.fault(elsewhere, OpenedPicture(PICTURE, "", 0.02, b"c0")) == ""  # another camera
 
 
 def test_thinning_keeps_the_rate_of_each_camera(tmp_path):
     stamps = np.arange(0, 2_000_000_000, 50_000_000) + np.random.default_rng(0).integers(0, 4_000_000, 40)
     rows = [Picture(i, int(t), name, "", tmp_path) for i, t in enumerate(stamps) for name in ("a", "b")]
-    kept = images.thinned(rows, 4.0)
+    kept = images.limit_rate(rows, 4.0)
     for name in "ab":
         mine = [row.t_ns for row in kept if row.camera == name]
         assert len(mine) == 8 and min(np.diff(mine)) > 0.23e9
-    assert images.thinned(rows, 0.0) == rows
+    assert images.limit_rate(rows, 0.0) == rows
 
 
 def test_the_longest_break_counts_the_ends(tmp_path):

@@ -11,7 +11,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.streams import GnssFix, Images
-from smartnav_graph.vision.map import Known, own_fixes, pose_fixes
+from smartnav_graph.vision.map import KnownPositions, map_pose_fixes, own_fixes
 
 COUNT = 12
 T0_NS, STEP_NS, OFFSET_S = 10**12, 5 * 10**8, 0.02
@@ -52,7 +52,7 @@ def session(files=None):
 
 def known(t=None, **options):
     t = truth()[0] if t is None else t
-    return Known(T0_NS + round(OFFSET_S * 1e9) + STEP_NS * np.arange(len(t)), t, **options)
+    return KnownPositions(T0_NS + round(OFFSET_S * 1e9) + STEP_NS * np.arange(len(t)), t, **options)
 
 
 def cameras_from_map():
@@ -100,7 +100,7 @@ def worst(found, rows=slice(None)):
 
 
 def test_the_poses_of_a_reconstruction_come_back():
-    found = pose_fixes(reconstruction(), session(), known())
+    found = map_pose_fixes(reconstruction(), session(), known())
     position, rotation = worst(found)
     assert position < 1e-6 and rotation < 1e-5
     assert found.similarity.scale == pytest.approx(1.0 / SCALE, rel=1e-9)
@@ -114,19 +114,19 @@ def test_an_adjusted_reconstruction_comes_back_to_the_millimetre(tmp_path):
     built = reconstruction(moved=0.003)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
-    assert worst(pose_fixes(built, session(), known()))[0] > 0.005
+    assert worst(map_pose_fixes(built, session(), known()))[0] > 0.005
     pycolmap.bundle_adjustment(built, options)
     built.write(tmp_path)
-    position, rotation = worst(pose_fixes(tmp_path, session(), known()))
+    position, rotation = worst(map_pose_fixes(tmp_path, session(), known()))
     assert position < 1e-3 and rotation < 0.02
 
 
 def test_a_wrong_mount_shows():
     moved = session().replace(sensors={"cam0": Mount((0.12, 0.95, 0.08), tuple(map(tuple, BODY_R_CAM)))})
-    assert pose_fixes(reconstruction(), session(), known()).similarity.sigma < 1e-9
-    assert pose_fixes(reconstruction(), moved, known()).similarity.sigma > 1e-3
+    assert map_pose_fixes(reconstruction(), session(), known()).similarity.sigma < 1e-9
+    assert map_pose_fixes(reconstruction(), moved, known()).similarity.sigma > 1e-3
     turned = session().replace(sensors={"cam0": Mount(BODY_T_CAM, tuple(map(tuple, BODY_R_CAM.T)))})
-    assert worst(pose_fixes(reconstruction(), turned, known()))[1] > 10.0
+    assert worst(map_pose_fixes(reconstruction(), turned, known()))[1] > 10.0
 
 
 def test_sigmas_come_from_what_the_positions_leave():
@@ -134,29 +134,30 @@ def test_sigmas_come_from_what_the_positions_leave():
     ratios, sigmas = [], []
     for _ in range(40):
         noisy = known(truth()[0] + rng.normal(0.0, 0.1, (COUNT, 3)))
-        found = pose_fixes(reconstruction(), session(), noisy)
+        found = map_pose_fixes(reconstruction(), session(), noisy)
         sigmas.append(found.fixes.sigma[0, 0])
         turn = Rotation.from_matrix(found.similarity.nav_R_map @ MAP_R_NAV.as_matrix()).as_rotvec()
-        ratios.append(turn**2 / found.similarity.turn_sigma**2)
+        ratios.append(turn**2 / found.similarity.rotation_sigma**2)
     assert 0.6 < np.mean(ratios) < 1.5  # 120 squares, 1 +- 0.13
     assert 0.094 < np.mean(sigmas) < 0.106  # 0.1 +- 0.002
 
 
 def test_positions_known_of_some_images_serve_for_all():
     t = truth()[0]
-    few = Known(known().t_ns[:6], t[:6])
-    found = pose_fixes(reconstruction(), session(), few)
+    few = KnownPositions(known().t_ns[:6], t[:6])
+    found = map_pose_fixes(reconstruction(), session(), few)
     assert found.counts["aligned"] == 6 and found.counts["used"] == COUNT
     assert worst(found)[0] < 1e-6
-    between = Known(known().t_ns[::3], t[::3], longest_gap_s=1.0)  # 1.5 s apart: nothing is interpolated
-    assert pose_fixes(reconstruction(), session(), between).counts["aligned"] == 4
+    rows = [0, 1, 6, 11]  # up to 2.5 s apart: nothing is interpolated
+    between = KnownPositions(known().t_ns[rows], t[rows])
+    assert map_pose_fixes(reconstruction(), session(), between).counts["aligned"] == 4
     with pytest.raises(SolverError, match="0 images with a known position; expected at least 4"):
-        pose_fixes(reconstruction(), session(), Known(np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
+        map_pose_fixes(reconstruction(), session(), KnownPositions(np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
 
 
 def test_images_without_a_pose_or_unknown_are_counted():
     names = [f"{k:04d}.png" for k in range(COUNT - 1)] + ["other.png"]
-    found = pose_fixes(reconstruction(names, without_pose=(2, 5)), session(), known())
+    found = map_pose_fixes(reconstruction(names, without_pose=(2, 5)), session(), known())
     assert found.counts == {"used": COUNT - 3, "aligned": COUNT - 3, "unknown": 1, "unregistered": 2}
     rows = [k for k in range(COUNT - 1) if k not in (2, 5)]
     assert worst(found, rows)[0] < 1e-6
@@ -164,41 +165,41 @@ def test_images_without_a_pose_or_unknown_are_counted():
 
 def test_what_cannot_be_aligned_is_refused():
     with pytest.raises(SolverError, match="3 images with a known position; expected at least 4"):
-        pose_fixes(reconstruction(), session(), known(truth()[0][:3]))
+        map_pose_fixes(reconstruction(), session(), known(truth()[0][:3]))
     line = np.linspace(0.0, 5.0, COUNT)[:, None] * np.array([[1.0, 0.5, 0.0]])
     with pytest.raises(SolverError, match=r"deg only|on one line"):
-        pose_fixes(reconstruction(), session(), known(line))
+        map_pose_fixes(reconstruction(), session(), known(line))
     with pytest.raises(SolverError, match=r"deg only|on one line"):
-        pose_fixes(reconstruction(), session(), known(np.zeros((COUNT, 3))))
+        map_pose_fixes(reconstruction(), session(), known(np.zeros((COUNT, 3))))
 
 
 def test_wrong_input_is_named(tmp_path):
     with pytest.raises(SessionError, match="cannot be read"):
-        pose_fixes(tmp_path / "none", session(), known())
+        map_pose_fixes(tmp_path / "none", session(), known())
     (tmp_path / "cameras.bin").write_bytes(b"x")
     with pytest.raises(SessionError, match="cannot be read"):
-        pose_fixes(tmp_path, session(), known())
+        map_pose_fixes(tmp_path, session(), known())
     with pytest.raises(SessionError, match=r"none of its 12 registered images is the session's \(such as a00.png"):
-        pose_fixes(reconstruction([f"a{k:02d}.png" for k in range(COUNT)]), session(), known())
+        map_pose_fixes(reconstruction([f"a{k:02d}.png" for k in range(COUNT)]), session(), known())
     with pytest.raises(SessionError, match="no images"):
-        pose_fixes(reconstruction(), session().replace(images=None), known())
+        map_pose_fixes(reconstruction(), session().replace(images=None), known())
 
 
 def test_wrong_positions_are_named():
     t = truth()[0]
     for wrong in (t[:5], np.where(np.arange(3) == 1, np.nan, t)):
         with pytest.raises(SessionError, match="known positions: 12 times and positions"):
-            pose_fixes(reconstruction(), session(), known()._replace(nav_t=wrong))
+            map_pose_fixes(reconstruction(), session(), known()._replace(nav_t=wrong))
     with pytest.raises(SessionError, match="expected ascending times"):
-        pose_fixes(reconstruction(), session(), known()._replace(t_ns=known().t_ns[::-1]))
+        map_pose_fixes(reconstruction(), session(), known()._replace(t_ns=known().t_ns[::-1]))
 
 
 def test_a_real_model_agrees_with_its_own_text(dataset):
     folder = dataset("lund_door")
     recorded = sn.load(str(folder))
     reference = recorded.reference
-    where = Known(reference.t_ns, 2.5 * reference.enu)
-    found = pose_fixes(folder / "colmap_ground_truth", recorded, where)
+    where = KnownPositions(reference.t_ns, 2.5 * reference.enu)
+    found = map_pose_fixes(folder / "colmap_ground_truth", recorded, where)
     assert found.counts == {"used": 12, "aligned": 12, "unknown": 0, "unregistered": 0}
     assert found.similarity.scale == pytest.approx(2.5, rel=1e-6)
     np.testing.assert_allclose(found.fixes.enu, where.nav_t, atol=1e-5)
@@ -212,25 +213,25 @@ def test_the_antenna_stands_beside_the_camera():
     arm = (0.3, -0.8, 1.1)
     t, R = truth()
     at_antenna = known(t + R @ np.array(arm))
-    found = pose_fixes(reconstruction(), session(), at_antenna._replace(body_t=arm))
+    found = map_pose_fixes(reconstruction(), session(), at_antenna._replace(body_t=arm))
     assert worst(found)[0] < 1e-6
-    assert worst(pose_fixes(reconstruction(), session(), at_antenna))[0] > 0.1
+    assert worst(map_pose_fixes(reconstruction(), session(), at_antenna))[0] > 0.1
     fixes = GnssFix(t_ns=at_antenna.t_ns, enu=at_antenna.nav_t)
     recorded = session().replace(gnss=fixes, sensors={**session().sensors, "gnss": Mount(arm)})
-    assert worst(pose_fixes(reconstruction(), recorded, own_fixes(recorded)))[0] < 1e-6
-    with pytest.raises(SessionError, match=r"no gnss fixes to lay a map on.*--known RUN"):
+    assert worst(map_pose_fixes(reconstruction(), recorded, own_fixes(recorded)))[0] < 1e-6
+    with pytest.raises(SessionError, match=r"no gnss fixes to align a map.*--known RUN"):
         own_fixes(session())
 
 
 def test_fixes_of_a_sensor_beside_the_body_are_refused():
     placed = session().replace(sensors={**session().sensors, "pose_fixes": Mount((0.0, 0.1, 0.0))})
     with pytest.raises(SessionError, match=r"places a sensor of pose fixes.*\[sensors.pose_fixes\]"):
-        pose_fixes(reconstruction(), placed, known())
+        map_pose_fixes(reconstruction(), placed, known())
 
 
 def test_two_files_of_one_name_need_their_folder():
     files = [f"{folder}/{k:04d}.png" for folder in ("left", "right") for k in range(COUNT // 2)]
     names = [f"left/{k:04d}.png" for k in range(COUNT // 2)]
-    assert pose_fixes(reconstruction(names), session(files), known()).counts["used"] == COUNT // 2
+    assert map_pose_fixes(reconstruction(names), session(files), known()).counts["used"] == COUNT // 2
     with pytest.raises(SessionError, match="none of its 6 registered images"):
-        pose_fixes(reconstruction([name.split("/")[1] for name in names]), session(files), known())
+        map_pose_fixes(reconstruction([name.split("/")[1] for name in names]), session(files), known())

@@ -38,7 +38,7 @@ def test_a_second_call_reads_what_the_first_one_kept(made, folder, monkeypatch):
     def never(*_args, **_options):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(match_store, "find", never)
+    monkeypatch.setattr(match_store, "run_front_end", never)
     again = match_store.match(folder, CONFIG)
     assert made[1].computed and not again.computed
     assert again.report == made[1].report
@@ -82,9 +82,9 @@ def test_changed_pictures_or_calibration_are_noticed(folder):
 
 def test_rows_of_unknown_origin_are_not_taken_for_ours(folder):
     (folder / "matches.toml").unlink()
-    assert "does not tell what it was made of" in refused(folder)
+    assert "does not say how it was made" in refused(folder)
     (folder / "matches.toml").write_text("no toml")
-    assert "does not tell what it was made of" in refused(folder)
+    assert "does not say how it was made" in refused(folder)
 
 
 def test_edited_rows_are_noticed(folder):
