@@ -2,7 +2,7 @@
 
     python scripts/bare_recording.py SESSION RUN FILE     one JSON line: processor seconds, size of the file
 
-Inertial samples, poses, velocities, ellipsoids, biases with their variances, sigmas, residuals: as they stand in the
+Inertial samples, poses, velocities, ellipsoids, biases with their variances, sigmas, residuals: as they are in the
 session and in the run, without layout, states, log, graph or a second time line.
 """
 

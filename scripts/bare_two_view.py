@@ -46,7 +46,7 @@ def errors_deg(R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(turn)), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def told(seconds: float, errors: list[tuple[float, float]]) -> dict[str, float]:
+def summary(seconds: float, errors: list[tuple[float, float]]) -> dict[str, float]:
     """Seconds a pair, median errors."""
     rotation, direction = np.median(errors, axis=0)
     return {"seconds": seconds / PAIRS, "rotation_deg": round(rotation, 4), "direction_deg": round(direction, 4)}
@@ -61,7 +61,7 @@ def main() -> None:
         E, mask = cv2.findEssentialMat(px0, px1, K, cv2.USAC_MAGSAC, 0.999, 1.0)
         _, R, t, _ = cv2.recoverPose(E, px0, px1, K, mask=mask)
         found.append((R.T, -R.T @ t.ravel()))
-    print(json.dumps(told(time.process_time() - begin, [errors_deg(R, t) for R, t in found])))
+    print(json.dumps(summary(time.process_time() - begin, [errors_deg(R, t) for R, t in found])))
 
 
 if __name__ == "__main__":

@@ -61,8 +61,8 @@ def solve(folder: str) -> dict[str, float]:
     end = optimiser.optimize()
     seconds = time.process_time() - begin
     assert abs(graph.error(end) - found.cost) < 0.05 * found.cost + 10.0, (graph.error(end), found.cost)
-    told = {"seconds": seconds, "iterations": optimiser.iterations(), "pairs": pairs, "cost": graph.error(end)}
-    return told | {"vectorised_seconds": ours, "times_faster": seconds / ours}
+    result = {"seconds": seconds, "iterations": optimiser.iterations(), "pairs": pairs, "cost": graph.error(end)}
+    return result | {"vectorised_seconds": ours, "times_faster": seconds / ours}
 
 
 def vectorised(found: Estimate, start: gtsam.Values) -> float:

@@ -4,7 +4,7 @@
 
 batch-37min       simulated drive of 37 min in memory -> solution with 15x15 covariances, self-calibration off (noise,
                   clock offset) and no vehicle constraint; baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
-batch-37min-full  the same with everything on: no calibration, fixes without sigmas, wandering errors, noise found,
+batch-37min-full  the same with everything on: no calibration, fixes without sigmas, correlated errors, noise found,
                   clock offset, vehicle constraint; baseline as above
 batch-2h          two hours, as batch-37min; baseline: batch-37min
 replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive that comes with gtsam, lag 10 s;
@@ -58,42 +58,42 @@ def python(*arguments: str) -> dict[str, Any]:
 
 
 def bare(factor: str) -> Measured:
-    told = python(str(HERE / "bare_gtsam.py"), str(MINUTES), factor)
-    return Measured(told["total_s"], None, {key: told[key] for key in ("cpu_s", "iterations")})
+    result = python(str(HERE / "bare_gtsam.py"), str(MINUTES), factor)
+    return Measured(result["total_s"], None, {key: result[key] for key in ("cpu_s", "iterations")})
 
 
 def bare_fixed_lag() -> Measured:
-    told = python(str(HERE / "bare_fixed_lag.py"), "gtsam-kitti", "10")
-    return Measured(told["p99"] / 1e3, None, told)
+    result = python(str(HERE / "bare_fixed_lag.py"), "gtsam-kitti", "10")
+    return Measured(result["p99"] / 1e3, None, result)
 
 
 def bare_front_end(folder: str) -> Measured:
-    told = python(str(HERE / "bare_front_end.py"), folder)
-    return Measured(told["seconds"], None, told)
+    result = python(str(HERE / "bare_front_end.py"), folder)
+    return Measured(result["seconds"], None, result)
 
 
 def bare_two_view() -> Measured:
-    told = python(str(HERE / "bare_two_view.py"))
-    return Measured(told.pop("seconds"), None, told)
+    result = python(str(HERE / "bare_two_view.py"))
+    return Measured(result.pop("seconds"), None, result)
 
 
 def bare_recording(session: str, run: str, file: str) -> Measured:
-    told = python(str(HERE / "bare_recording.py"), session, run, file)
-    return Measured(told.pop("seconds"), None, told)
+    result = python(str(HERE / "bare_recording.py"), session, run, file)
+    return Measured(result.pop("seconds"), None, result)
 
 
 def bare_vision_solve(session: str) -> Measured:
-    told = python(str(HERE / "bare_vision_solve.py"), "solve", session)
-    return Measured(told["seconds"], None, told)
+    result = python(str(HERE / "bare_vision_solve.py"), "solve", session)
+    return Measured(result["seconds"], None, result)
 
 
 def ours(kind: str, session: str) -> Measured:
-    told = python(str(HERE / "benchmark.py"), "--measure", kind, session)
-    return Measured(told["seconds"], told["peak_memory_mb"], told["detail"])
+    result = python(str(HERE / "benchmark.py"), "--measure", kind, session)
+    return Measured(result["seconds"], result["peak_memory_mb"], result["detail"])
 
 
 def measure(kind: str, path: str) -> None:
-    """In the fresh process: one run of a session in memory, told as a JSON line."""
+    """In the fresh process: one run of a session in memory, printed as a JSON line."""
     if kind == "front-end":
         measure_front_end(Path(path))
         return
@@ -131,10 +131,10 @@ def measure(kind: str, path: str) -> None:
     seconds -= alone
     if kind == "replay":
         seconds = run.summary["update_ms"]["p99"] / 1e3
-    tell(seconds, detail)
+    print_result(seconds, detail)
 
 
-def tell(seconds: float, detail: dict[str, Any]) -> None:
+def print_result(seconds: float, detail: dict[str, Any]) -> None:
     """What a fresh process says."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     print(json.dumps({"seconds": seconds, "peak_memory_mb": round(peak, 1), "detail": detail}))
@@ -160,9 +160,9 @@ def measure_front_end(folder: Path) -> None:
     cpu, begin = time.process_time(), time.perf_counter()
     report = run_front_end(session, FrontEndConfig(spans=(1,))).report
     seconds = time.perf_counter() - begin
-    told = {"pairs_per_s": round(report.pairs / seconds, 1), "cpu_s": round(time.process_time() - cpu, 4)}
+    result = {"pairs_per_s": round(report.pairs / seconds, 1), "cpu_s": round(time.process_time() - cpu, 4)}
     keys = ("pairs", "matches", "ms_picture", "ms_pair")
-    tell(seconds, told | {key: getattr(report, key) for key in keys})
+    print_result(seconds, result | {key: getattr(report, key) for key in keys})
 
 
 def measure_two_view() -> None:
@@ -178,8 +178,8 @@ def measure_two_view() -> None:
     found = [two_view(*pair, sigma) for pair in pairs]
     seconds = time.process_time() - begin
     assert all(view.kind == "general" and np.isfinite(view.covariance).all() for view in found)
-    figures = bare.told(seconds, [bare.errors_deg(view.c0_R_c1, view.c0_t_c1) for view in found])
-    tell(figures.pop("seconds"), figures)
+    figures = bare.summary(seconds, [bare.errors_deg(view.c0_R_c1, view.c0_t_c1) for view in found])
+    print_result(figures.pop("seconds"), figures)
 
 
 def measure_recording(path: Path, *, with_pictures: bool) -> None:
@@ -201,7 +201,7 @@ def measure_recording(path: Path, *, with_pictures: bool) -> None:
         detail = {"wall_s": round(time.perf_counter() - begin, 4), "size_mb": round(file.stat().st_size / 1e6, 2)}
     detail |= {"samples": len(session.require_imu()), "keyframes": len(run.solution)}
     detail |= {"pictures": 0 if session.images is None else len(session.images)}
-    tell(cpu, detail)
+    print_result(cpu, detail)
 
 
 def pictured(session: Any, folder: Path, count: int) -> Any:
@@ -264,7 +264,7 @@ Job = Callable[[], Measured]
 
 
 def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
-    """What is measured, its baseline, and what is only told beside them."""
+    """What is measured, its baseline, and what is only reported beside them."""
     plain = make_session(f"car-{MINUTES}min", folder) if name.startswith("batch") else ""
     if name == "batch-37min":
         return lambda: ours("batch", plain), lambda: bare("imu"), {"bare_combined": lambda: bare("combined")}
@@ -299,8 +299,8 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
     found, base = (middle(list(column)) for column in zip(*rounds, strict=True))
     detail: dict[str, Any] = {"job": found.detail, "baseline": base.detail, "repeat": repeat}
     for label, other in beside.items():
-        told = middle([other() for _ in range(min(repeat, 3))])
-        detail[label] = told.seconds if label.startswith("bare") else {"seconds": told.seconds, **told.detail}
+        result = middle([other() for _ in range(min(repeat, 3))])
+        detail[label] = result.seconds if label.startswith("bare") else {"seconds": result.seconds, **result.detail}
     return {
         "name": name,
         "seconds": round(found.seconds, 5),
