@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from smartnav_graph.session.stream import Positioned, Stream
+from smartnav_graph.session.stream import Located, Stream
 
 
 def example(kind: type[Stream], n: int = 6, *, optional: bool = True, geodetic: bool = False) -> Stream:
@@ -12,7 +12,7 @@ def example(kind: type[Stream], n: int = 6, *, optional: bool = True, geodetic: 
     rng = np.random.default_rng(sum(map(ord, kind.NAME)))
     values = {}
     for spec in kind.specs():
-        if spec.name in ("lla", "enu") and issubclass(kind, Positioned) and (spec.name == "lla") != geodetic:
+        if spec.name in ("lla", "enu") and issubclass(kind, Located) and (spec.name == "lla") != geodetic:
             continue
         if spec.default is None and not optional and spec.name not in ("lla", "enu"):
             continue

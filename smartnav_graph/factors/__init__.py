@@ -22,6 +22,7 @@ from smartnav_graph.factors import (
     pedestrian,
     pose_fix,
     prior,
+    ranging,
     smart,
     standstill,
     vehicle,
@@ -97,6 +98,7 @@ FACTORS: Mapping[str, Factor] = {
         "pose_fixes",
         "pose_fixes",
     ),
+    "ranges": Factor(STREAMS["ranges"].LABEL, ranging.build, ranging.RangeConfig, "ranges", "ranges"),
     "static": Factor(
         STREAMS["static"].LABEL,
         standstill.build,

@@ -6,7 +6,6 @@ error that wanders are states.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -24,7 +23,7 @@ from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gauss_markov import add_wander, wander_sigma
 from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
-from smartnav_graph.graph.robust import check_loss, robust
+from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
@@ -36,11 +35,6 @@ LEAST_WANDERING_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
-# The same for a fix against its prediction, until so many have told how far predictions and fixes are apart: the clock
-# and the noise are not settled yet, only gross faults count.
-CAUSAL_TAIL = 9.0
-SETTLED = 10
-REMEMBERED = 30
 LEAST_WEIGHT = 1e-4  # below it a row is left out
 
 
@@ -137,7 +131,7 @@ class PositionBuilder(Builder):
     gravity: float = STANDARD_GRAVITY
     least_gate_sigma: float = 0.0
     stage: int = 0
-    _squares: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
     def __post_init__(self) -> None:
         self.lever = np.broadcast_to(self.lever, self.position.shape)
@@ -192,15 +186,8 @@ class PositionBuilder(Builder):
         foretold = update.predicted.position() + update.predicted.attitude().matrix() @ self.lever[row]
         wander = wander_sigma(self.noise) ** 2 if self.name in pass_state.correlated else 0.0
         square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + update.variance + wander)).sum())
-        return "cauchy" if self._surprises(square, row) else "none"
-
-    def _surprises(self, square: float, row: int) -> bool:
-        """Whether a fix contradicts its prediction, by the normalised square of this one and of those before: an
-        outlier hardly moves their median, and a solution that went astray is not left alone for long."""
-        known = self._squares
-        level = float(np.median(known) / chi2.median(3)) if len(known) >= SETTLED else CAUSAL_TAIL
-        known.append(square)
-        return bool(self.gate(np.array([square]), level, np.array([row]))[0])
+        outside = self.gate(np.array([square]), self._level.before(square), np.array([row]))
+        return "cauchy" if outside[0] else "none"
 
     def has_second_stage(self, pass_state: PassState) -> bool:
         """Whether there is more to these fixes once the trajectory is found: states of their own."""

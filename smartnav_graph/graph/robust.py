@@ -6,6 +6,7 @@ iteratively reweighted least-squares, for the constants.
 
 from __future__ import annotations
 
+from collections import deque
 from functools import lru_cache
 
 import gtsam
@@ -15,6 +16,9 @@ from scipy.stats import chi2
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 
+# Until so many measurements were compared with their predictions, only gross faults count: clocks and noise are not
+# known yet. Level (of normalised squares) assumed until then, and how many are remembered.
+FIRST_LEVEL, ENOUGH, REMEMBERED = 9.0, 10, 30
 LOSSES = ("none", "huber", "cauchy")
 HUBER = 1.345  # keeps 95 % efficiency on Gaussian residuals of one component
 
@@ -74,3 +78,19 @@ def robust(model: gtsam.noiseModel.Base, loss: str, reach: float = 1.0) -> gtsam
     limit = huber_limit(model.dim())
     estimator = estimators.Huber.Create(limit * reach) if loss == "huber" else estimators.Cauchy.Create(reach)
     return gtsam.noiseModel.Robust.Create(estimator, model)
+
+
+class PredictionLevel:
+    """How far measurements of `dim` components are from their predictions in a replay, beside what their sigmas say:
+    an outlier hardly moves the median, and a solution that diverged soon accepts measurements again."""
+
+    def __init__(self, dim: int) -> None:
+        self._median = float(chi2(dim).median())
+        self._squares: deque[float] = deque(maxlen=REMEMBERED)
+
+    def before(self, square: float) -> float:
+        """Level of the measurements before one with this normalised square, which is remembered; 1 is as expected."""
+        known = self._squares
+        level = float(np.median(known)) / self._median if len(known) >= ENOUGH else FIRST_LEVEL
+        known.append(square)
+        return level

@@ -20,8 +20,9 @@ class StateKind:
     """One row of the state table.
 
     scope : ``keyframe`` (one a keyframe), ``chain`` (one a keyframe, where its sensor has it), ``session`` (one)
-    trust (dim,) : step that a damping of one holds the state to
-    moved (dim,) : step that moves its linearisation point in replay
+    damping_scale (dim,) : step that a damping of one holds the state to
+    relinearize_threshold (dim,) : step that moves its linearisation point in replay
+    fixable : held at its prior mean where the data do not determine it; otherwise its prior counts as a measurement
     """
 
     letter: str
@@ -30,6 +31,7 @@ class StateKind:
     scope: str
     damping_scale: Floats
     relinearize_threshold: Floats
+    fixable: bool = True
 
 
 def _kind(
@@ -57,6 +59,7 @@ STATES: dict[str, StateKind] = {
         _kind("F", "magnetic field strength", "session", [30.0] * 2, [1.0] * 2),
         _kind("U", "floor height", "session", [1.0], [0.1]),
         _kind("K", "step factor", "session", [0.3] * 2, [0.02] * 2),
+        StateKind("R", "range bias", 1, "session", np.array([1.0]), np.array([0.1]), fixable=False),
         _kind("S", "inertial scale and misalignment", "session", [0.03] * 18, [0.003] * 18),
     )
 }

@@ -17,7 +17,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.session.calibration.model import Calibration
-from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.stream import Located, Positioned
 from smartnav_graph.session.streams import Imu, Streams
 
 SCHEMA = 1
@@ -78,7 +78,7 @@ class Session(Streams):
         if self.clock_epoch not in EPOCHS:
             raise SessionError("session.toml [clock]", f"epoch = {self.clock_epoch!r}", f"one of {', '.join(EPOCHS)}")
         for name, stream in self.streams().items():
-            if self.origin is None and isinstance(stream, Positioned) and stream.lla is not None:
+            if self.origin is None and isinstance(stream, Located) and stream.lla is not None:
                 raise SessionError(
                     name,
                     "lat_deg, lon_deg, height_m in a session without origin",
@@ -121,7 +121,7 @@ class Session(Streams):
         """The local frame, where an origin is known."""
         return None if self.origin is None else LocalFrame(self.origin)
 
-    def nav_position(self, stream: Positioned) -> NDArray[np.float64]:
+    def nav_position(self, stream: Located) -> NDArray[np.float64]:
         """Positions (n, 3) of a stream in nav metres."""
         if stream.enu is not None:
             return stream.enu

@@ -206,8 +206,8 @@ ENU = ("e_m", "n_m", "u_m")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Positioned(Stream):
-    """Rows with a position: `lla` (lat deg, lon deg, ellipsoidal height m) or `enu` metres of the local frame."""
+class Located(Stream):
+    """Rows that name a place: `lla` (lat deg, lon deg, ellipsoidal height m) or `enu` metres of the local frame."""
 
     ABSOLUTE: ClassVar[bool] = True
     AIDING: ClassVar[bool] = True
@@ -215,4 +215,10 @@ class Positioned(Stream):
 
     lla: Floats | None = quantity(*LLA, optional=True)
     enu: Floats | None = quantity(*ENU, optional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Positioned(Located):
+    """Rows with a position of a sensor of the device, and its 1-sigma (n, 3) m."""
+
     sigma: Floats | None = axes("sigma_{}_m", "enu", optional=True, nan=True)

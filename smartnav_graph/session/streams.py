@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args, get_type_hints
 
+import numpy as np
+
 from smartnav_graph.core.arrays import Floats, Texts, Times
-from smartnav_graph.session.stream import ENU, Label, Positioned, Stream, axes, quantity
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.session.stream import ENU, Label, Located, Positioned, Stream, axes, quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,33 @@ class PoseFix(Positioned):
     quat: Floats | None = quantity("qw", "qx", "qy", "qz", optional=True, nan=True)
     sigma_rot: Floats | None = axes("sigma_{}_rad", "enu", optional=True, nan=True)
     source: Texts | None = quantity("source", optional=True, kind="text")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranges(Located):
+    """Distances `range_m` (n,) m to anchors (UWB, WiFi round-trip time, acoustic), with sigma (n,) m. The place of a
+    row is that of its anchor."""
+
+    NAME: ClassVar[str] = "ranges"
+    LABEL: ClassVar[Label] = Label("Ranges", "range", "ranges", colour=(150, 220, 90))
+    UNIQUE_TIMES: ClassVar[bool] = False
+
+    anchor_id: Texts = quantity("anchor_id", kind="text")
+    range_m: Floats = quantity("range_m")
+    sigma: Floats | None = quantity("sigma_m", optional=True, nan=True)
+
+    def _check_rows(self) -> None:
+        super()._check_rows()
+        below = np.flatnonzero(self.range_m < 0)
+        if len(below):
+            row = int(below[0])
+            found = f"range_m is {self.range_m[row]} at row {row} ({len(below)} such rows in all)"
+            raise SessionError(self.NAME, found, ">= 0 m", "leave the row out", row=row, stream=self.NAME)
+
+    def sigmas(self, default: float) -> Floats:
+        """Sigma (n,) m of each row, `default` where it has none."""
+        known = np.full(len(self), np.nan) if self.sigma is None else self.sigma
+        return np.where(np.isfinite(known), known, default)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +222,7 @@ class Streams:
     imu: Imu | None = None
     gnss: GnssFix | None = None
     control: ControlPoint | None = None
+    ranges: Ranges | None = None
     static: StaticPeriod | None = None
     pose_fixes: PoseFix | None = None
     magnetometer: Magnetometer | None = None

@@ -23,13 +23,20 @@ from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.core.so3 import quaternion
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session import folder as session_folder
-from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, GnssNoise, MagnetometerNoise
+from smartnav_graph.session.calibration.model import (
+    BarometerNoise,
+    Calibration,
+    GnssNoise,
+    MagnetometerNoise,
+    RangeNoise,
+)
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
-from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Reference, StaticPeriod
-from smartnav_graph.simulation import cameras, fixes, render, sensors
+from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Ranges, Reference, StaticPeriod
+from smartnav_graph.simulation import cameras, fixes, ranges, render, sensors
 from smartnav_graph.simulation.cameras import SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
+from smartnav_graph.simulation.ranges import RangeModel
 from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
 
@@ -38,7 +45,7 @@ START_NS = 1_748_772_000 * NS  # 2025-06-01 10:00 UTC
 YEAR = 2025.41
 RATE_HZ = 100
 SLOW_ROWS = 10  # reference: every tenth inertial sample
-_OWN_EPOCHS = ("gnss", "control", "pose_fixes", "images")
+_OWN_EPOCHS = ("gnss", "control", "pose_fixes", "ranges", "images")
 CONTROL_SIGMA_M = 0.02
 
 
@@ -62,6 +69,7 @@ class Scenario:
     velocity: SpeedModel | None = None
     pose_fixes: PoseFixModel | None = None
     camera: SimulatedCamera | None = None
+    ranges: RangeModel | None = None
     rest_sigma_m_s: float = 0.01
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
@@ -71,7 +79,7 @@ class Scenario:
 # Every purpose has random numbers of its own: a new sensor is added at the end and leaves the others as they were.
 PURPOSES = (
     *("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes"),
-    *("scene", "camera", "texture", "pictures"),
+    *("scene", "camera", "texture", "pictures", "ranges"),
 )
 
 
@@ -112,12 +120,15 @@ def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
         "gnss": _gnss(ride, scenario.gnss),
         "control": _control(ride) if scenario.control else None,
         "pose_fixes": _pose_fixes(ride, scenario.pose_fixes),
+        "ranges": _ranges(ride, scenario.ranges),
         **_slow_sensors(ride, scenario),
         **_camera(ride, scenario.camera),
     }
     rows = [np.arange(0, len(t), SLOW_ROWS)]
     rows += [np.searchsorted(ride.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
     mounts = {} if scenario.gnss is None else {"gnss": Mount(body_t=scenario.gnss.body_t_antenna)}
+    if scenario.ranges is not None:
+        mounts["ranges"] = Mount(body_t=scenario.ranges.body_t_sensor)
     if scenario.camera is not None:
         mounts[scenario.camera.name] = scenario.camera.mount
     return Session(
@@ -157,6 +168,13 @@ def _pose_fixes(ride: _Ride, model: PoseFixModel | None) -> PoseFix | None:
         return None
     at = np.searchsorted(ride.t, np.arange(model.first_s, ride.t[-1], model.every_s) - 1e-9)
     return fixes.simulate_pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
+
+
+def _ranges(ride: _Ride, model: RangeModel | None) -> Ranges | None:
+    if model is None:
+        return None
+    every = ride.rows(model.rate_hz)
+    return ranges.ranges(ride.truth.take(every), ride.t_ns[every], model, ride.frame, ride.rng("ranges"))
 
 
 def _camera(ride: _Ride, model: SimulatedCamera | None) -> dict[str, Stream | None]:
@@ -265,6 +283,8 @@ def _calibration(scenario: Scenario) -> Calibration:
         made = replace(made, magnetometer_noise=iron)
     if (baro := scenario.barometer) is not None and baro.walk_hpa > 0:
         made = replace(made, barometer_noise=BarometerNoise(baro.sigma_hpa, baro.walk_hpa))
+    if (ranging := scenario.ranges) is not None:
+        made = replace(made, range_noise=RangeNoise(ranging.sigma_m, ranging.bias_sigma_m))
     if (camera := scenario.camera) is not None:
         made = replace(made, cameras={camera.name: camera.camera})
     return made

@@ -23,6 +23,7 @@ from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.cameras import LOOKING_AHEAD, Faults, PictureModel, SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
+from smartnav_graph.simulation.ranges import RangeModel
 from smartnav_graph.simulation.recording import Scenario
 from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
@@ -136,6 +137,7 @@ SCENARIOS: dict[str, Scenario] = {
             control=True,
             **_ALL_SENSORS,
         ),
+        Scenario("ranges-60s", 60.0, _eight, ranges=RangeModel(detours=0.03)),
         Scenario("rendered-room-10s", 10.0, motions.in_a_room, profile="galaxy-s2", camera=_RENDERED),
         Scenario("room-30s", 30.0, motions.in_a_room, profile="galaxy-s2", camera=_ROOM),
         Scenario(

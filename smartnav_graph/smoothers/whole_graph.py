@@ -132,11 +132,12 @@ def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -
 
 
 def stacks_of(blocks: Iterable[FactorBatch], held: Held) -> list[StackedFactors]:
-    """Blocks joined by sensor, model and loss."""
-    groups: dict[tuple[str, int, str], list[FactorBatch]] = {}
+    """Blocks joined by sensor, model, loss and which of their states are held."""
+    groups: dict[tuple[str, int, str, tuple[bool, ...]], list[FactorBatch]] = {}
     for block in blocks:
         if block.keys:
-            groups.setdefault((block.sensor, id(block.model), block.loss), []).append(block)
+            constant = tuple(name in held for name in block.keys[0])
+            groups.setdefault((block.sensor, id(block.model), block.loss, constant), []).append(block)
     return [StackedFactors(group[0].model, group, held) for group in groups.values()]
 
 

@@ -22,8 +22,8 @@ from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.states import kind_of
 from smartnav_graph.session.calibration.model import BarometerNoise, Calibration, MagnetometerNoise
-from smartnav_graph.session.session import Device, Session
-from smartnav_graph.session.streams import Magnetometer, PoseFix, Velocity, WheelSpeed
+from smartnav_graph.session.session import Device, Mount, Session
+from smartnav_graph.session.streams import Magnetometer, PoseFix, Ranges, Velocity, WheelSpeed
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 
@@ -178,6 +178,30 @@ def recognised(seed: int | None) -> Recording:
     return replace(made, session=made.session.replace(pose_fixes=stream))
 
 
+ANCHORS = np.array([[-16.0, -8.0, 2.0], [5.0, -8.0, 3.0], [5.0, 8.0, 2.0], [-16.0, 8.0, 3.0]])
+ANCHOR_BIAS = np.array([0.2, -0.1, 0.3, 0.0])  # m
+RANGE_STATES = {f"ranges_bias_A{i}_m": [bias] for i, bias in enumerate(ANCHOR_BIAS)}
+
+
+@cache
+def ranged(seed: int | None) -> Recording:
+    """A figure eight among four anchors that are heard one after the other, and nothing else."""
+    made = record(seed=seed)
+    t = np.arange(0.4, 29.5, 0.25)
+    there, row = made.trajectory.sample(t), np.arange(len(t)) % 4
+    sensor = there.nav_t_body + there.nav_R_body @ np.array(LEVER)
+    white = np.random.default_rng((0 if seed is None else seed, 5)).standard_normal(len(t)) * (seed is not None)
+    stream = Ranges(
+        t_ns=START_NS + ns_from_seconds(t),
+        anchor_id=np.array([f"A{i}" for i in row], dtype=object),
+        enu=ANCHORS[row],
+        range_m=np.linalg.norm(sensor - ANCHORS[row], axis=1) + ANCHOR_BIAS[row] + 0.05 * white,
+        sigma=np.full(len(t), 0.05),
+    )
+    sensors = {"ranges": Mount(body_t=LEVER)}
+    return replace(made, session=made.session.replace(ranges=stream, gnss=None, control=None, sensors=sensors))
+
+
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
 
@@ -303,6 +327,22 @@ CASES: dict[str, Case] = {
             "clock late by 0.1 s": (_late("pose_fixes"), 3.0),  # 0.8 rad/s for a sigma of 0.01 rad
         },
         known=FIX_STATES,
+    ),
+    "ranges": Case(
+        ranged,
+        1e-6,
+        {
+            "feet": (_column("ranges", "range_m", lambda r: r / 0.3048), 100.0),
+            "nav axes swapped": (_column("ranges", "enu", lambda p: p[:, [1, 0, 2]]), 50.0),
+            "anchors confused": (_column("ranges", "enu", np.flipud), 20.0),
+            "height sign": (_column("ranges", "enu", lambda p: p * [1, 1, -1]), 3.0),
+            "lever arm forgotten": (lambda session: session.replace(sensors={}), 5.0),
+            "lever arm sign": (lambda s: s.replace(sensors={"ranges": Mount(body_t=tuple(-x for x in LEVER))}), 10.0),
+            "bias sign": (_column("ranges", "range_m", lambda r: r - 2 * np.resize(ANCHOR_BIAS, len(r))), 3.0),
+            "clock late by 0.1 s": (_late("ranges"), 0.8),  # 1.5 m/s, partly across, for a sigma of 0.05 m
+        },
+        known=RANGE_STATES,
+        stream=("ranges", "range_m"),
     ),
     "gnss_velocity": Case(
         car,

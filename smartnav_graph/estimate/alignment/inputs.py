@@ -13,12 +13,14 @@ from smartnav_graph.estimate.alignment.attitude import LONGEST_S, AttitudeStart,
 from smartnav_graph.estimate.alignment.first_stretch import FirstStretch, Fixes
 from smartnav_graph.estimate.alignment.initial_state import UserStart
 from smartnav_graph.estimate.alignment.magnetic import field_start
+from smartnav_graph.estimate.alignment.multilateration import multilaterate
 from smartnav_graph.estimate.alignment.pedestrian import SPARSE_S, Walk, walked
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.magnetometer import IRON, MagnetometerBuilder
 from smartnav_graph.factors.pedestrian import StepBuilder
 from smartnav_graph.factors.pose_fix import AttitudeBuilder
+from smartnav_graph.factors.ranging import RangeBuilder
 from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.update import one_of
 
@@ -128,9 +130,18 @@ def measured_positions(problem: Problem) -> Fixes:
     )
 
 
+def ranged_positions(problem: Problem) -> Fixes:
+    """Positions by multilateration, where ranges are all there is."""
+    builder, ranges = one_of(problem.builders, RangeBuilder), problem.session.ranges
+    if builder is None or ranges is None or problem.session.positions() or problem.config.run.initial:
+        return Fixes.none()
+    found = multilaterate(ranges, builder.anchor, builder.sigma)
+    return Fixes(found.t_ns, found.position, found.available_ns, [(builder.name, int(row)) for row in found.row])
+
+
 # What gives the positions of the first stretch. A sensor whose rows give positions only together adds a function, which
 # gives none where the measured ones suffice.
-POSITIONS: Sequence[Callable[[Problem], Fixes]] = (measured_positions,)
+POSITIONS: Sequence[Callable[[Problem], Fixes]] = (measured_positions, ranged_positions)
 
 
 def absolute_positions(problem: Problem) -> Fixes:

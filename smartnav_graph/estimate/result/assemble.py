@@ -26,6 +26,7 @@ from smartnav_graph.graph.robust import loss_weights
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.streams import ABSOLUTE
 from smartnav_graph.smoothers.estimate import Estimate, values_of
 from smartnav_graph.smoothers.whole_graph import StackedFactors
 
@@ -246,7 +247,7 @@ def _image_times(problem: Problem) -> NDArray[np.int64]:
 def used_counts(problem: Problem, pass_state: PassState) -> Mapping[str, int]:
     """Rows of every absolute sensor that the solution rests on."""
     counts = {}
-    for name in (builder.name for builder in position_builders(problem.builders)):
+    for name in (builder.name for builder in problem.builders if builder.name in ABSOLUTE):
         there = sum(len(w.rows.get(name, ())) + len(w.delayed.get(name, ())) for w in problem.windows)
         unused = len(pass_state.rejected.get(name, ())) + problem.dropped.get(name, {}).get(TOO_LATE, 0)
         counts[name] = there - unused

@@ -58,7 +58,7 @@ def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
             "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
         )
     if not estimate.converged:
-        doubts.append("solve: the iteration limit was reached before the cost settled; raise solve.max_iterations")
+        doubts.append("solve: the iteration limit was reached before the cost settled; raise solver.max_iterations")
     if chi2 > MISFIT:
         doubts.append(
             f"solve: chi-square per degree of freedom is {chi2:.1f}, about 1 is expected: the measurements contradict "

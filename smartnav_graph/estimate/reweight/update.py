@@ -35,6 +35,7 @@ from smartnav_graph.factors.smart import SmartBuilder
 from smartnav_graph.factors.vehicle import VehicleBuilder
 from smartnav_graph.graph import gnc
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
+from smartnav_graph.graph.states import kind_of
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers.estimate import Estimate
@@ -155,7 +156,7 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     blind = {
         state.name: state.prior_mean
         for state in estimate.session.values()
-        if not state.held and (state.sigma > OBSERVED * state.prior_sigma).all()
+        if not state.held and kind_of(state.key).fixable and (state.sigma > OBSERVED * state.prior_sigma).all()
     }
     return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=wandering)
 

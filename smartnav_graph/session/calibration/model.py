@@ -96,6 +96,14 @@ class PoseFixNoise:
 
 
 @dataclass(frozen=True)
+class RangeNoise:
+    """Ranges that carry no sigma of their own, m: white noise; bias_sigma : m, of the constant error of an anchor."""
+
+    sigma: float = 0.2
+    bias_sigma: float = 0.3
+
+
+@dataclass(frozen=True)
 class StepNoise:
     """Prior on the step length of a pedestrian.
 
@@ -191,12 +199,14 @@ class Calibration:
     pose_fix_noise: PoseFixNoise = field(default_factory=PoseFixNoise)
     barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
     step_noise: StepNoise = field(default_factory=StepNoise)
+    range_noise: RangeNoise = field(default_factory=RangeNoise)
     magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for part in (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise):
+        noises = (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise)
+        for part in (*noises, self.range_noise):
             for f in dataclasses.fields(part):
                 value = getattr(part, f.name)
                 may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
