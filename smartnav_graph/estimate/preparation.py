@@ -122,7 +122,7 @@ def withhold(session: Session, notes: Notes) -> Session:
 
 
 def drop_outside(session: Session, notes: Notes) -> Session:
-    """Absolute streams inside the span. Rows outside the inertial data are counted, those cut by --from, --to are not."""
+    """Absolute streams inside the span. Rows outside the inertial data are counted, those outside --from, --to not."""
     imu = session.require_imu()
     changes: dict[str, Stream | None] = {}
     for name, stream in session.absolute().items():

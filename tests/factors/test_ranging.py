@@ -11,6 +11,7 @@ from differences import average_nees_bounds
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
+from smartnav_graph.core import frames
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.estimate.alignment.multilateration import multilaterate
 from smartnav_graph.evaluation.consistency import nees
@@ -22,8 +23,8 @@ from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.ranges import RangeModel
 from smartnav_graph.simulation.recording import Scenario
 
-# A walk of a minute goes east and south, up to 60 m.
-AROUND = ((-15.0, 20.0, 3.0), (50.0, 15.0, 5.0), (45.0, -60.0, 3.0), (-15.0, -65.0, 4.0), (15.0, -20.0, 6.0))
+# A walk of a minute goes east and south, up to 60 m; anchors of one height would hardly tell that of the walker.
+AROUND = ((-15.0, 20.0, 0.0), (50.0, 15.0, 12.0), (45.0, -60.0, 2.0), (-15.0, -65.0, 15.0), (15.0, -20.0, 8.0))
 ARM = (0.05, 0.10, 0.02)
 
 
@@ -73,7 +74,7 @@ def test_wrong_options_are_refused(wrong):
 
 def test_a_negative_range_is_refused():
     ranges = walk(0, seconds=2.0).ranges
-    with pytest.raises(SessionError, match="range_m is -1.0 at row 2"):
+    with pytest.raises(SessionError, match=r"range_m is -1\.0 at row 2"):
         replace(ranges, range_m=np.where(np.arange(len(ranges)) == 2, -1.0, ranges.range_m))
 
 
@@ -86,8 +87,8 @@ def test_multilateration_of_exact_ranges_is_within_the_prior_of_the_height(ancho
     found = multilaterate(session.ranges, session.nav_position(session.ranges), np.full(len(session.ranges), 0.1))
     true = session.reference.enu[np.searchsorted(session.reference.t_ns, found.t_ns)]
     assert len(found.t_ns) == 60
-    assert np.abs(found.position - true)[:, :2].max() < 0.2  # m: the height is off by up to 3 m, 30 m away
-    assert np.abs(found.position - true)[:, 2].max() < 4.0
+    assert np.abs(found.position - true)[:, :2].max() < 1.0  # m: the height is off by 6 m, 40 m away
+    assert np.abs(found.position - true)[:, 2].max() < 8.0
 
 
 def test_anchors_heard_one_after_the_other_make_groups_of_one_round():
@@ -111,9 +112,10 @@ def test_a_start_that_the_anchors_leave_ambiguous_is_refused(anchors, what):
 
 def test_two_anchors_are_enough_beside_a_given_start():
     session = walk(0, anchors=AROUND[:2])
-    first = sn.smooth(walk(0))
+    R = Rotation.from_quat(session.reference.quat[:1, [1, 2, 3, 0]]).as_matrix()
+    heading = frames.heading_pitch_roll_deg(R, session.device.forward)[0, 0]
     east, north, up = session.reference.enu[0]
-    solution = sn.smooth(session, initial=f"{east},{north},{up},{first.heading_deg[0]},0.5,5")
+    solution = sn.smooth(session, initial=f"{east},{north},{up},{heading},0.5,5")
     assert np.linalg.norm(errors(session, solution)[:, :2], axis=1).max() < 3.0
 
 
@@ -152,8 +154,11 @@ def test_replay_is_near_as_soon_as_it_has_begun():
 def test_a_late_range_is_used_at_its_own_time():
     session = walk(2)
     late = session.replace(ranges=replace(session.ranges, arrival_ns=session.ranges.t_ns + 300_000_000))
-    in_time, delayed = (errors(s, sn.run(s, causal=True).causal)[60:, :2] for s in (session, late))
-    assert np.sqrt((delayed**2).mean()) < 2.0 * np.sqrt((in_time**2).mean()) + 0.1  # 0.4 m further: 0.3 s at 1.35 m/s
+    used, causal = sn.run(late, causal=True), errors(session, sn.run(session, causal=True).causal)
+    assert used.summary["factors"]["ranges"] >= 0.98 * len(session.ranges)
+    half = errors(session, used.causal)
+    rms = [float(np.sqrt((rows[len(rows) // 2 :, :2] ** 2).mean())) for rows in (half, causal)]
+    assert rms[0] < rms[1] + 0.15, rms  # taken as of their arrival they would be off by 0.4 m: 0.3 s at 1.35 m/s
 
 
 def test_a_folder_of_csv_files_has_ranges(tmp_path):
@@ -163,9 +168,8 @@ def test_a_folder_of_csv_files_has_ranges(tmp_path):
         rows = zip(*columns.values(), strict=True)
         text = "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)])
         (tmp_path / f"{name}.csv").write_text(text + "\n")
-    (tmp_path / "session.toml").write_text(
-        "schema = 1\n[origin]\nlat_deg = 52.0\nlon_deg = 11.0\nheight_m = 100.0\n[sensors.ranges]\nbody_t = [0.05, 0.1, 0.02]\n"
-    )
+    origin = "[origin]\nlat_deg = 52.0\nlon_deg = 11.0\nheight_m = 100.0\n"
+    (tmp_path / "session.toml").write_text(f"schema = 1\n{origin}[sensors.ranges]\nbody_t = [0.05, 0.1, 0.02]\n")
     back = load(tmp_path)
     np.testing.assert_array_equal(back.ranges.range_m, session.ranges.range_m)
     assert back.ranges.anchor_id.tolist() == session.ranges.anchor_id.tolist()

@@ -97,7 +97,8 @@ class PoseFixNoise:
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """Ranges that carry no sigma of their own, m: white noise; bias_sigma : m, of the constant error of an anchor."""
+    """Ranges that carry no sigma of their own, m: white noise; bias_sigma : m, of the constant error of an anchor,
+    zero for none."""
 
     sigma: float = 0.2
     bias_sigma: float = 0.3
@@ -209,7 +210,7 @@ class Calibration:
         for part in (*noises, self.range_noise):
             for f in dataclasses.fields(part):
                 value = getattr(part, f.name)
-                may_be_zero = f.name.startswith("correlated_") and f.name.endswith("_sigma")
+                may_be_zero = f.name.endswith("_sigma") and f.name.startswith(("correlated_", "bias_"))
                 if not (math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
                     raise CalibrationError(
                         "calibration.toml", f"{f.name} = {value}", "a finite number > 0", "give SI units"
