@@ -6,8 +6,8 @@
 
 Noise is added to the pixels, as a detector makes it, and taken through the camera's model to undistorted normalised
 coordinates. A frame stamped t shows the time t + `Camera.time_offset_s` + `clock_s` in its first row, and `readout_s`
-later in its last. The session is told the camera and the mount of the model: `boresight_deg` and `clock_s` are what
-nobody tells it. Extra column `truth_inlier`: 1 where both ends of a match, or the observation of a track, are the
+later in its last. The session holds the camera and the mount of the model; `boresight_deg` and `clock_s` are errors
+unknown to it. Extra column `truth_inlier`: 1 where both ends of a match, or the observation of a track, are the
 projection of one point of the scene and noise.
 """
 
@@ -18,9 +18,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Indices, Mask, Times
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import exp, rotate_back
 from smartnav_graph.core.timebase import NS
@@ -30,7 +29,6 @@ from smartnav_graph.session.streams import Images, Matches, Tracks
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
 
-Rows = NDArray[np.intp]
 Range = tuple[float, float]
 
 # Optical axes (x right, y down, z forward) of a camera that looks along +y of a body with z up.
@@ -41,7 +39,7 @@ _ROW_PASSES = 3
 
 @dataclass(frozen=True)
 class Faults:
-    """What spoils features, but for noise.
+    """Faults of features beside noise.
 
     outliers : share of wrong ones, drawn anew for every pair or frame between the two; lost : share of a frame's
     tracks that end in it; glitches : (s, px), in the frame next to that time every feature is off by so much in one
@@ -83,12 +81,12 @@ class PictureModel:
 class SimulatedCamera:
     """A camera and what is kept of its images.
 
-    camera, mount : as the session is told; rate_hz : of images; scene : made anew for each seed
+    camera, mount : as in the session; rate_hz : of images; scene : new for each seed
     count : fewest and most features of a pair (matches) or a frame (tracks); pairs : spans between the images of a
     pair, () for no matches; tracked : tracks too; pictures : rendered ones
     range_m : nearest (depth) and farthest point that is seen
     boresight_deg : the true axes are body_R_cam Exp(boresight), degrees about the optical axes; clock_s : a frame
-    shows the world so much later than the session is told
+    shows a time so much later than the session assumes
     """
 
     camera: Camera
@@ -127,7 +125,7 @@ class SimulatedCamera:
 class Projection(NamedTuple):
     """Points of the scene (k,) that a frame shows, and where, exactly: pixels (k, 2)."""
 
-    rows: Rows
+    rows: Indices
     xy_px: Floats
 
 
@@ -195,10 +193,10 @@ def _flat(points: Floats) -> Floats:
     return np.asarray(points[:, :2] / points[:, 2:])
 
 
-def _in_sight(model: SimulatedCamera, R: Floats, centre: Floats, scene: Scene) -> Rows:
+def _in_sight(model: SimulatedCamera, R: Floats, centre: Floats, scene: Scene) -> Indices:
     """Points in front, within range, and not far beyond the corners of the image, where distortion would fold them in.
 
-    The margin leaves room for what moves while a rolling shutter reads out.
+    The margin allows for motion during the readout of a rolling shutter.
     """
     camera = model.camera
     corners = np.array([[x, y] for x in (0, camera.width - 1) for y in (0, camera.height - 1)], dtype=np.float64)
@@ -219,7 +217,7 @@ def _jumps(model: SimulatedCamera, t: Floats, rng: np.random.Generator) -> Float
     return jumps
 
 
-def _blind(model: SimulatedCamera, t: Floats) -> NDArray[np.bool_]:
+def _blind(model: SimulatedCamera, t: Floats) -> Mask:
     blind = np.zeros(len(t), dtype=bool)
     for start, length in model.faults.blind:
         blind |= (t >= start) & (t < start + length)
@@ -233,7 +231,7 @@ def _noisy(model: SimulatedCamera, xy_px: Floats, rng: np.random.Generator) -> F
 def _matches(
     model: SimulatedCamera, views: Sequence[Projection], jumps: Floats, t_ns: Times, rng: np.random.Generator
 ) -> Matches | None:
-    """Matches of images so many apart as `pairs` says."""
+    """Matches of images whose numbers differ by one of `pairs`."""
     found = [
         (i, i + span, *pair)
         for i in range(len(views))
@@ -258,7 +256,7 @@ def _matches(
 
 def _pair(
     model: SimulatedCamera, one: Projection, other: Projection, rng: np.random.Generator
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Mask]:
     """Pixels (m, 2) in both images and whether they are the same point: a wrong match takes another point of the
     second image."""
     common, i, j = np.intersect1d(one.rows, other.rows, return_indices=True)
@@ -296,7 +294,7 @@ def _tracks(
 
 def _followed(
     model: SimulatedCamera, views: Sequence[Projection], rng: np.random.Generator
-) -> Iterator[tuple[Rows, Floats]]:
+) -> Iterator[tuple[Indices, Floats]]:
     """Track numbers (k,) and exact pixels (k, 2) in each frame."""
     points, ids, fresh = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for shown in views:

@@ -1,4 +1,4 @@
-"""A real, faulty session made of a good one: noisier fixes, outliers, missing, jittered, repeated and broken rows.
+"""A real session with simulated faults: noisier fixes, outliers, missing, jittered, repeated and broken rows.
 
 Faults that a valid session can hold (noise, outliers, missing rows) are in what `degrade` returns. Row faults break a
 stream's own rules, so they appear only on disk: `write_degraded` writes the session and then spoils imu.parquet, and
@@ -10,12 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices, Table
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import replacing, write_table
 from smartnav_graph.core.progress import Progress, silent
@@ -25,8 +23,6 @@ from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import GnssFix, Imu, Reference
 from smartnav_graph.simulation import fixes
 from smartnav_graph.simulation.fixes import Outliers
-
-Table = dict[str, NDArray[Any]]
 
 _FAULTS = ("gnss_white", "gnss_gm", "outliers", "jitter", "rows", "nan")
 
@@ -156,7 +152,7 @@ def _degrade_fixes(whole: Session, options: Degrade, seed: int) -> Session:
     return whole.replace(gnss=_moved(whole, fix, noisy, sigma, extra), reference=known_truth)
 
 
-def _moved(whole: Session, fix: GnssFix, enu: Floats, sigma: Any, extra: Table) -> GnssFix:
+def _moved(whole: Session, fix: GnssFix, enu: Floats, sigma: Floats | None, extra: Table) -> GnssFix:
     """The fix stream at other places, geodetic or local as it was."""
     values = {spec.name: getattr(fix, spec.name) for spec in fix.specs()} | {"sigma": sigma, "extra": extra}
     if fix.enu is not None:
@@ -196,7 +192,7 @@ def spoil_rows(table: Table, options: Degrade, seed: int = 0) -> Table:
     return {name: column[order] for name, column in rows.items()}
 
 
-def _disjoint_rows(n: int, options: Degrade, rng: np.random.Generator) -> list[NDArray[np.intp]]:
+def _disjoint_rows(n: int, options: Degrade, rng: np.random.Generator) -> list[Indices]:
     """Rows with NaN, rows to repeat, first rows of swapped pairs: no row in two of them, so that counts stay exact."""
     counts = [round(share * n) for share in (options.nan_rows, options.duplicates, options.swaps)]
     kinds = rng.permutation(np.repeat([0, 1, 2], counts))

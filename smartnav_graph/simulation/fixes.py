@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.so3 import exp, quaternion, rotate
@@ -47,8 +46,8 @@ class Outliers:
 @dataclass(frozen=True)
 class GnssModel:
     """A receiver: `rate_hz`, white sigma, Gauss-Markov sigma and correlation time, lever arm, outages (start s,
-    length s) and outliers; `velocity_m_s` > 0 is the sigma of velocities that come with the fixes; stamped t, a fix
-    speaks of the time t + `offset_s`."""
+    length s) and outliers; `velocity_m_s` > 0 is the sigma of velocities that come with the fixes; a fix stamped t is
+    valid at the time t + `offset_s`."""
 
     rate_hz: float = 1.0
     white_m: float = 3.0
@@ -64,7 +63,7 @@ class GnssModel:
 @dataclass(frozen=True)
 class PoseFixModel:
     """Pose fixes every `every_s` seconds from `first_s` on, position sigma m and attitude sigma rad per axis (0: no
-    attitude), known `latency_s` after the time they speak of."""
+    attitude), arriving `latency_s` after their stamp."""
 
     every_s: float = 5.0
     first_s: float = 2.0
@@ -99,7 +98,7 @@ def place_runs(n: int, lengths: Sequence[int], rng: np.random.Generator, *, apar
     Raises
     ------
     ConfigError
-        There is no room.
+        There are too few rows.
     """
     free = n - sum(lengths)
     slots = free + 1 if apart else free + len(lengths)
@@ -110,7 +109,7 @@ def place_runs(n: int, lengths: Sequence[int], rng: np.random.Generator, *, apar
     return [int(row) for row in (chosen + before if apart else chosen + before - np.arange(len(lengths)))]
 
 
-def outlier_errors(t_ns: Times, outliers: Outliers, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+def outlier_errors(t_ns: Times, outliers: Outliers, rng: np.random.Generator) -> tuple[Floats, Mask]:
     """Errors (n, 3) m, zero but for the outliers, and their mask (n,): exactly round(share n) of them.
 
     The last burst is cut to keep the count.
@@ -120,8 +119,8 @@ def outlier_errors(t_ns: Times, outliers: Outliers, rng: np.random.Generator) ->
     period = float(np.median(np.diff(t_ns))) / NS if n > 1 else 1.0
     lengths: list[int] = []
     while left > 0:
-        wish = 1 if outliers.kind == "isolated" else max(1, round(float(rng.uniform(*BURST_S)) / period))
-        lengths.append(min(wish, left))
+        wanted = 1 if outliers.kind == "isolated" else max(1, round(float(rng.uniform(*BURST_S)) / period))
+        lengths.append(min(wanted, left))
         left -= lengths[-1]
     errors, mask = np.zeros((n, 3)), np.zeros(n, dtype=bool)
     for row, length in zip(place_runs(n, lengths, rng, apart=True), lengths, strict=True):
@@ -136,10 +135,10 @@ def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np
 
     Column `is_outlier` (kept in `extra`) marks outliers with 1.
     """
-    heard = np.ones(len(truth), dtype=bool)
+    received = np.ones(len(truth), dtype=bool)
     for start, length in model.outages:
-        heard &= ~((truth.t >= start) & (truth.t < start + length))
-    truth, t_ns = truth.take(heard), t_ns[heard]
+        received &= ~((truth.t >= start) & (truth.t < start + length))
+    truth, t_ns = truth.take(received), t_ns[received]
     n = len(t_ns)
     enu = truth.nav_t_body + truth.nav_R_body @ np.asarray(model.body_t_antenna) + white(n, model.white_m, rng)
     if model.markov_m > 0:

@@ -63,7 +63,8 @@ def car(duration: float, rng: np.random.Generator, *, start_speed: float = 0.0) 
 
 
 def slip(rng: np.random.Generator, sigma: float, axes: tuple[int, ...] = (0, 2)) -> tuple[Sway, ...]:
-    """Side and vertical speeds of `sigma` m/s each (root mean square at the sway speed) that no vehicle should have.
+    """Violation of the constraints of a vehicle: side and vertical speeds of `sigma` m/s (root mean square at the sway
+    speed).
 
     Three slow sines a direction with phases of their own: samples a second apart are nearly independent.
     """
@@ -89,7 +90,7 @@ def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajector
     return Trajectory(Legs(legs, heading_deg=25.0), sway=sway)
 
 
-# A trolley pushed over a floor: castors and joints, the rocking load, the hand that steers, the steps of who pushes.
+# A trolley pushed over a floor: castors and joints, the rocking load, the steering hand, the steps of the person.
 _CASTORS = (
     Sway(hertz=6.0, shift=(0.0, 0.0, 2e-4), tilt=(0.0, 1e-3, 0.0)),
     Sway(hertz=1.1, tilt=(0.0, 0.002, 0.003), phase=0.4),
@@ -99,8 +100,7 @@ _CASTORS = (
 
 
 def creep(rng: np.random.Generator, speed: float, rate: float) -> tuple[Sway, ...]:
-    """How what stands gives way over minutes: `speed` m/s an axis and `rate` rad/s in yaw, root mean square each; from
-    where it was put."""
+    """Slow motion of a device at rest over minutes: `speed` m/s per axis and `rate` rad/s in yaw, root mean squares."""
     waves = []
     for hertz in (1 / 90, 1 / 160, 1 / 310):
         size = np.sqrt(2.0 / 3.0) / (2 * np.pi * hertz) * rng.choice([-1.0, 1.0], 4)
@@ -113,12 +113,12 @@ def creep(rng: np.random.Generator, speed: float, rate: float) -> tuple[Sway, ..
 class Corridors:
     """A trolley pushed along the corridors of a grid, from a long rest.
 
-    It starts at the origin facing north, which is what a start from a rest takes for granted where nothing else is
-    told. Each word of `turns` is the way to the next stop of `stop_s`: a letter a crossing, with a turn of 90 deg to
-    the left (L) or right (R) within `turn_s`. The first of three crossings is taken in an arc, at `corner_m_s`; at the
+    It starts at the origin facing north: the mean of the initial state after a standstill without other measurements.
+    Each word of `turns` is the way to the next stop of `stop_s`: a letter per crossing, with a turn of 90 deg to the
+    left (L) or right (R) within `turn_s`. The first of three crossings is taken in an arc, at `corner_m_s`; at the
     others it halts, is turned on the spot and halts again, each time for `halt_s`. Speeds change within `ramp_s`.
-    Nothing that people lean on is quite at rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the speeds
-    left an axis, root mean square.
+    A trolley held by a person is not exactly at rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the
+    remaining speeds per axis, root mean square.
     """
 
     turns: tuple[str, ...] = (
@@ -139,7 +139,7 @@ class Corridors:
     sway: tuple[Sway, ...] = _CASTORS
 
     def __call__(self, seconds: float, rng: np.random.Generator) -> Trajectory:
-        """The motion; it takes as long as it takes."""
+        """The motion; its duration is given by the turns, not by `seconds`."""
         legs = [Leg(self.rest_s, 0.0)]
         for word in self.turns:
             legs += [*self._way(word), Leg(self.stop_s, 0.0)]

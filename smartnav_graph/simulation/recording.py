@@ -1,6 +1,6 @@
-"""A scenario -> a recorded session with its truth: the same type a reader gives, `reference` holding the exact states.
+"""A scenario -> a recorded session with its truth: the same type as of a reader, `reference` holding the exact states.
 
-The truth stands at 10 Hz and at every epoch of a fix or an image, on exact inertial stamps. All recordings: 100 Hz
+The truth is given at 10 Hz and at every epoch of a fix or an image, on exact inertial stamps. All recordings: 100 Hz
 inertial samples, flat ENU frame at 52 N, 11 E, 100 m, gravity constant and straight down, no Earth rotation.
 """
 
@@ -10,12 +10,11 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats, Indices, Times
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import replacing
 from smartnav_graph.core.frames import LocalFrame, Origin
@@ -53,7 +52,7 @@ CONTROL_SIGMA_M = 0.02
 class Scenario:
     """A motion of `seconds` (the first samples of it), a device and its sensors; call it with a seed.
 
-    rest_sigma_m_s : what the listed standstills say of the speed left
+    rest_sigma_m_s : sigma of the velocity at the listed standstills
     """
 
     name: str
@@ -88,13 +87,13 @@ class _Ride:
     """One motion sampled at the inertial stamps, and the random numbers of every purpose."""
 
     trajectory: Trajectory
-    t: NDArray[np.float64]
+    t: Floats
     truth: Truth
     seed: int
     frame: LocalFrame
 
     @property
-    def t_ns(self) -> NDArray[np.int64]:
+    def t_ns(self) -> Times:
         return START_NS + ns_from_seconds(self.t)
 
     def rng(self, purpose: str) -> np.random.Generator:
@@ -150,9 +149,9 @@ def _gnss(ride: _Ride, model: GnssModel | None) -> GnssFix | None:
     every = ride.rows(model.rate_hz)
     truth, t_ns = ride.truth.take(every), ride.t_ns[every]
     if model.offset_s:
-        spoken = ride.t[every] + model.offset_s
-        inside = (spoken >= 0.0) & (spoken <= ride.trajectory.duration)
-        truth, t_ns = ride.trajectory.sample(spoken[inside]), t_ns[inside]
+        valid = ride.t[every] + model.offset_s
+        inside = (valid >= 0.0) & (valid <= ride.trajectory.duration)
+        truth, t_ns = ride.trajectory.sample(valid[inside]), t_ns[inside]
     return fixes.gnss(truth, t_ns, model, ride.frame, ride.rng("gnss"))
 
 
@@ -218,13 +217,13 @@ def shots(scenario: Scenario, seed: int) -> Iterator[render.Grey]:
     yield from render.render_pictures(model, ride.trajectory, painted, t, model.pictures, ride.rng("pictures"))
 
 
-def scenario_constants(scenario: Scenario) -> dict[str, Any]:
-    """Every constant of a scenario by its dotted name, and the noise of its device: what makes it, but for the seed."""
+def scenario_constants(scenario: Scenario) -> dict[str, object]:
+    """Every constant of a scenario by its dotted name, and the noise of its device: all but the seed."""
     noise = dataclasses.asdict(PROFILES[scenario.profile].noise)
     return _flat("", dataclasses.asdict(scenario) | {"noise": noise})
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
+def _flat(name: str, value: object) -> dict[str, object]:
     if isinstance(value, dict):
         parts = [_flat(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
         return {key: inner for part in parts for key, inner in part.items()}
@@ -236,25 +235,12 @@ def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:
     made: dict[str, Stream] = {}
     if (mag := scenario.magnetometer) is not None:
         rows, rng = ride.rows(mag.rate_hz), ride.rng("magnetometer")
-        made["magnetometer"] = sensors.magnetometer(
-            ride.truth.take(rows),
-            ride.t_ns[rows],
-            frames.magnetic_field_ut(ORIGIN, YEAR),
-            rng,
-            hard_iron_sigma_ut=mag.hard_iron_sigma_ut,
-            sigma_ut=mag.sigma_ut,
-            disturbances=mag.disturbances,
-        )
+        field = frames.magnetic_field_ut(ORIGIN, YEAR)
+        made["magnetometer"] = sensors.magnetometer(ride.truth.take(rows), ride.t_ns[rows], mag, field, rng)
     if (baro := scenario.barometer) is not None:
         rows, rng = ride.rows(baro.rate_hz), ride.rng("barometer")
-        made["barometer"] = sensors.barometer(
-            ORIGIN.height_m + ride.truth.nav_t_body[rows, 2],
-            ride.t_ns[rows],
-            rng,
-            offset_sigma_hpa=baro.offset_sigma_hpa,
-            sigma_hpa=baro.sigma_hpa,
-            walk_hpa=baro.walk_hpa,
-        )
+        height = ORIGIN.height_m + ride.truth.nav_t_body[rows, 2]
+        made["barometer"] = sensors.barometer(height, ride.t_ns[rows], baro, rng)
     if (model := scenario.wheel) is not None:
         rows, rng = ride.rows(model.rate_hz), ride.rng("wheel")
         made["wheel"] = sensors.wheel(ride.trajectory.speed(ride.t[rows]), ride.t_ns[rows], model, rng)
@@ -278,7 +264,7 @@ def _calibration(scenario: Scenario) -> Calibration:
         correlated_time=model.markov_s,
     )
     made = Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
-    if (mag := scenario.magnetometer) is not None:  # what stays alike for seconds is simulated as passing iron only
+    if (mag := scenario.magnetometer) is not None:  # correlated disturbances are simulated as passing iron only
         iron = MagnetometerNoise(sigma_ut=mag.sigma_ut, disturbance_ut=0.0, hard_iron_sigma_ut=mag.hard_iron_sigma_ut)
         made = replace(made, magnetometer_noise=iron)
     if (baro := scenario.barometer) is not None and baro.walk_hpa > 0:
@@ -294,7 +280,7 @@ def _within(trajectory: Trajectory, end: float) -> list[tuple[float, float]]:
     return [(start, min(stop, end)) for start, stop in trajectory.rests if start < end]
 
 
-def _static(trajectory: Trajectory, t_ns: NDArray[np.int64], sigma_m_s: float) -> StaticPeriod | None:
+def _static(trajectory: Trajectory, t_ns: Times, sigma_m_s: float) -> StaticPeriod | None:
     """The standstills, from the first to the last inertial sample taken at rest."""
     rests = _within(trajectory, float(t_ns[-1] - t_ns[0]) / NS)
     if not rests:
@@ -305,12 +291,12 @@ def _static(trajectory: Trajectory, t_ns: NDArray[np.int64], sigma_m_s: float) -
     return StaticPeriod(t_ns=t_ns[first], t_end_ns=t_ns[last], sigma_v=np.full(len(rests), sigma_m_s), source=source)
 
 
-def _stop_rows(trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.intp]:
+def _stop_rows(trajectory: Trajectory, t: Floats) -> Indices:
     """The inertial sample in the middle of every standstill."""
     return np.searchsorted(t, [(start + end) / 2 for start, end in _within(trajectory, float(t[-1]))])
 
 
-def reference(truth: Truth, t_ns: NDArray[np.int64], biases: Biases, rows: NDArray[np.intp]) -> Reference:
+def reference(truth: Truth, t_ns: Times, biases: Biases, rows: Indices) -> Reference:
     """The exact states at these rows."""
     return Reference(
         t_ns=t_ns[rows],

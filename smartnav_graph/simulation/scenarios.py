@@ -1,19 +1,19 @@
 """The named scenarios, each a `Scenario` that a seed turns into a session with its truth; see `recording`.
 
 With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min (matches of images up to 2 s apart, as
-`smartnav match` pairs them; its constants are frozen). These start at rest in the origin facing north and are told no
-position: a start without fixes takes just that for granted, in batch and replay alike, so that errors are those of the
-whole way. The trolley rests for three minutes and stops ten times for ten seconds; at two corners of three it halts for
-0.8 s before and after it is turned, too briefly to be found at rest, so that the listed halts hold its velocity and not
-its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False --standstill.zaru
-False``. A wrong boresight or camera clock, of which the session is told nothing: ``replace(scenario,
+`smartnav match` pairs them; its constants are frozen). These start at rest at the origin facing north and have no
+position measurements. That is also the initial state of a run without fixes, in batch and replay, so that errors are
+those of the whole way. The trolley rests for three minutes and stops ten times for ten seconds; at two corners of three
+it halts for 0.8 s before and after it is turned, too briefly to be detected, so that the listed halts fix its velocity
+and not its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False --standstill.zaru
+False``. A wrong boresight or camera clock, unknown to the session: ``replace(scenario,
 camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -59,11 +59,16 @@ def _steady_walk(seconds: float, rng: np.random.Generator) -> Trajectory:
     return motions.walk(seconds, rng, paces=(1.35, 1.35), often=1 / 3)
 
 
+class _Sensors(TypedDict):
+    magnetometer: MagnetometerModel
+    barometer: BarometerModel
+
+
 _PHONE_GNSS = GnssModel(white_m=3.0, markov_m=4.0, markov_s=60.0)
 _CAR_GNSS = GnssModel(white_m=3.0, body_t_antenna=(0.1, -0.6, 0.9))
-_PHONE_SENSORS: dict[str, Any] = {"magnetometer": MagnetometerModel(), "barometer": BarometerModel()}
-# Everything a phone session may have, with noise as it is: hard iron not calibrated, pressure that walks, late fixes.
-_ALL_SENSORS: dict[str, Any] = {
+_PHONE_SENSORS: _Sensors = {"magnetometer": MagnetometerModel(), "barometer": BarometerModel()}
+# Every sensor of a phone, with realistic noise: uncalibrated hard iron, pressure with a random walk, delayed fixes.
+_ALL_SENSORS: _Sensors = {
     "magnetometer": MagnetometerModel(hard_iron_sigma_ut=15.0),
     "barometer": BarometerModel(walk_hpa=0.003),
 }

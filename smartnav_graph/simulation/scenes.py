@@ -1,7 +1,7 @@
 """Rooms and corridors made of rectangles, the points scattered on them, and what a camera can see of both.
 
 A face is a rectangle corner + a u + b v, 0 <= a, b <= 1, seen from the side its normal u x v points to. Faces hide what
-lies behind them, so that nobody looks through a wall. All positions are nav metres (ENU).
+lies behind them. All positions are nav metres (ENU).
 """
 
 from __future__ import annotations
@@ -11,16 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.core.errors import ConfigError
-
-Rows = NDArray[np.intp]
 
 # Share of the way to a point within which another face hides it; the point itself lies on a face.
 _BEFORE = 1.0 - 1e-6
-# Metres before a face at which there must be room to see it from.
+# Metres before a face that must be free, or its points are not visible.
 _CLEAR_M = 1e-6
 # Every point is seen from `_NEAR_M`; from twice as far, half of them.
 _NEAR_M, _FAR_M = 4.0, 100.0
@@ -41,23 +38,23 @@ class Box:
 
 @dataclass(frozen=True)
 class Scene:
-    """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,), which stand out to a
-    distance of `reach` (n,) m: fine ones are seen from near only."""
+    """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,), which are visible up
+    to a distance of `reach` (n,) m."""
 
     corner: Floats
     u: Floats
     v: Floats
     points: Floats
-    face: Rows
+    face: Indices
     reach: Floats
 
     @cached_property
     def normal(self) -> Floats:
-        """Unit normals (f, 3) of the faces, towards those who see them."""
+        """Unit normals (f, 3) of the faces, towards the visible side."""
         normal = np.cross(self.u, self.v)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
-    def near(self, centre: Floats, range_m: float) -> Rows:
+    def near(self, centre: Floats, range_m: float) -> Indices:
         """Points within `range_m`, and within their reach, of a place (3,), in their order."""
         rows = np.flatnonzero(np.abs(self._east - centre[0]) < range_m)
         away = self.points[rows] - centre
@@ -67,12 +64,12 @@ class Scene:
     def _east(self) -> Floats:
         return np.ascontiguousarray(self.points[:, 0])
 
-    def seen_from(self, centre: Floats, rows: Rows) -> Rows:
+    def seen_from(self, centre: Floats, rows: Indices) -> Indices:
         """Those of the points `rows` that no face hides from a camera at `centre` (3,), and that face it."""
         ahead = np.einsum("ni,ni->n", centre - self.points[rows], self.normal[self.face[rows]]) > 0.0
         return self._unhidden(centre, rows[ahead])
 
-    def _unhidden(self, centre: Floats, rows: Rows) -> Rows:
+    def _unhidden(self, centre: Floats, rows: Indices) -> Indices:
         """Those without another face on the way to them; what is closed hides by a face seen from here."""
         height = np.einsum("fi,fi->f", centre - self.corner, self.normal)
         middle, size = self.corner + (self.u + self.v) / 2, np.linalg.norm(self.u + self.v, axis=1) / 2
@@ -103,8 +100,8 @@ def make_scene(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) ->
     return Scene(corner, u, v, scene.points[free], face[free], reach[free])
 
 
-def _free(points: Floats, boxes: Sequence[Box]) -> NDArray[np.bool_]:
-    """Mask of the places (n, 3) that lie in a room and in nothing that stands there."""
+def _free(points: Floats, boxes: Sequence[Box]) -> Mask:
+    """Mask of the places (n, 3) inside a room and outside of every solid box."""
     room, solid = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
     for box in boxes:
         within = ((points >= box.low) & (points <= box.high)).all(axis=1)

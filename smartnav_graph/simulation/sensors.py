@@ -1,8 +1,8 @@
 """What the sensors of a device read along an exact motion: inertial, magnetometer, barometer, wheel, velocity.
 
 Every sample is the true instantaneous quantity at its own stamp, plus bias and noise, as a real sensor gives it; it is
-no mean over the interval before or after. Whoever holds sample k constant over [t_k, t_k+1] therefore makes an error
-of first order in the interval; the mean of neighbouring samples is right to second order.
+no mean over the interval before or after. Holding sample k constant over [t_k, t_k+1] is therefore an error of first
+order in the interval; the mean of neighbouring samples is right to second order.
 Noise models: IEEE Std 952 (white noise and rate random walk).
 """
 
@@ -41,7 +41,7 @@ def _profile(
 ) -> DeviceProfile:
     """Profile of published sample sigmas by axis at 100 Hz: their quadratic mean, density = sigma / sqrt(100 Hz).
 
-    Bias walks were not published; they are those of the class unless told.
+    Bias walks were not published; they are those of the class unless given.
     """
     accel, gyro = (float(np.sqrt(np.mean(np.square(sigma)) / 100.0)) for sigma in (accel_noise, gyro_noise))
     noise = dataclasses.replace(
@@ -153,20 +153,13 @@ class SpeedModel:
 
 
 def magnetometer(
-    truth: Truth,
-    t_ns: Times,
-    nav_field_ut: Floats,
-    rng: np.random.Generator,
-    *,
-    hard_iron_sigma_ut: float = 1.0,
-    sigma_ut: float = 0.5,
-    disturbances: Sequence[tuple[float, float, float]] = (),
+    truth: Truth, t_ns: Times, model: MagnetometerModel, nav_field_ut: Floats, rng: np.random.Generator
 ) -> Magnetometer:
     """m = nav_R_body^T (B + disturbance) + hard iron + white noise, uT; the hard iron is constant, drawn first."""
-    hard_iron = hard_iron_sigma_ut * rng.standard_normal(3)
+    hard_iron = model.hard_iron_sigma_ut * rng.standard_normal(3)
     field = np.einsum("nji,j->ni", truth.nav_R_body, nav_field_ut) + hard_iron
-    field = field + sigma_ut * rng.standard_normal(field.shape)
-    for start, length, size in disturbances:
+    field = field + model.sigma_ut * rng.standard_normal(field.shape)
+    for start, length, size in model.disturbances:
         angle = rng.uniform(0.0, 2 * np.pi)
         swell = size * np.sin(np.pi * np.clip((truth.t - start) / length, 0.0, 1.0)) ** 2
         iron = swell[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -179,20 +172,14 @@ def standard_pressure(height_m: Floats) -> Floats:
     return np.asarray(1013.25 * (1.0 - 0.0065 * height_m / 288.15) ** 5.25588)
 
 
-def barometer(
-    height_m: Floats,
-    t_ns: Times,
-    rng: np.random.Generator,
-    *,
-    offset_sigma_hpa: float = 1.0,
-    sigma_hpa: float = 0.03,
-    walk_hpa: float = 0.0,
-) -> Barometer:
+def barometer(height_m: Floats, t_ns: Times, model: BarometerModel, rng: np.random.Generator) -> Barometer:
     """Standard pressure at `height_m` (n,) + an offset (the day's weather, the sensor) that walks + white noise."""
-    offset = offset_sigma_hpa * rng.standard_normal()
-    noise = sigma_hpa * rng.standard_normal(len(t_ns))
+    offset = model.offset_sigma_hpa * rng.standard_normal()
+    noise = model.sigma_hpa * rng.standard_normal(len(t_ns))
     steps = np.sqrt(np.diff(t_ns, prepend=t_ns[:1]) / NS) * rng.standard_normal(len(t_ns))
-    return Barometer(t_ns=t_ns, pressure_hpa=standard_pressure(height_m) + offset + noise + walk_hpa * np.cumsum(steps))
+    return Barometer(
+        t_ns=t_ns, pressure_hpa=standard_pressure(height_m) + offset + noise + model.walk_hpa * np.cumsum(steps)
+    )
 
 
 def wheel(speed_m_s: Floats, t_ns: Times, model: SpeedModel, rng: np.random.Generator) -> WheelSpeed:

@@ -8,7 +8,7 @@ A motion is a ride along the body's own forward direction plus a sway::
     nav_t_body = way + carried                            where it sits, in level axes (right, ahead, up)
     sway       = envelope * sum of sines, in level axes and in the held angles
 
-The envelope is speed / reference speed, so that whoever stands still does not sway. Speed, psi and slope are piecewise
+The envelope is speed / reference speed, so that a device at rest does not sway. Speed, psi and slope are piecewise
 quintics, twice continuously differentiable; all derivatives are closed forms. Position is the integral of velocity by
 Gauss-Legendre quadrature, exact to rounding. Body axes of a phone: x right, y ahead, z up; nav is ENU.
 """
@@ -18,13 +18,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import PPoly
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices, Mask, runs
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, rotate_back
 
@@ -52,7 +52,7 @@ class Truth:
     def __len__(self) -> int:
         return len(self.t)
 
-    def take(self, rows: NDArray[Any] | slice) -> Truth:
+    def take(self, rows: Mask | Indices | slice) -> Truth:
         """Only these rows (mask, indices or slice)."""
         return Truth(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
@@ -100,17 +100,11 @@ class Legs:
         step = smooth_steps(self.breaks, np.stack([speeds, psi, slope], axis=-1))
         self._orders = (step, step.derivative(), step.derivative(2))
         still = (speeds[:-1] == 0) & (speeds[1:] == 0) & (np.diff(psi) == 0) & (np.diff(slope) == 0)
-        self.rests = _merge(self.breaks, still)
+        self.rests = tuple((float(self.breaks[i]), float(self.breaks[j])) for i, j in runs(still))
 
     def __call__(self, t: Floats) -> tuple[Floats, Floats, Floats]:
         value, first, second = (order(t) for order in self._orders)
         return value, first, second
-
-
-def _merge(breaks: Floats, still: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    padded = np.concatenate([[False], still, [False]])
-    starts, ends = np.flatnonzero(~padded[:-1] & padded[1:]), np.flatnonzero(padded[:-1] & ~padded[1:])
-    return tuple((float(breaks[i]), float(breaks[j])) for i, j in zip(starts, ends, strict=True))
 
 
 class Eight:
@@ -151,7 +145,7 @@ class Sway:
 @dataclass(frozen=True)
 class Trajectory:
     """A way, how the device is held on it (yaw, pitch, roll in degrees), how it sways at `sway_speed` m/s, and where it
-    is `carried` (m to the right, ahead, up of the point that follows the way). `fidget` goes on at rest too."""
+    is `carried` (m to the right, ahead, up of the point that follows the way). `fidget` is a sway at rest too."""
 
     way: Way
     held_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -144,9 +144,8 @@ def uphill(seed: int | None) -> Recording:
     t = np.arange(0.003, 29.9, 0.1)
     height, t_ns = made.trajectory.sample(t).nav_t_body[:, 2], START_NS + ns_from_seconds(t)
     noise = 0.0 if seed is None else BarometerNoise().pressure_sigma
-    stream = sensors.barometer(
-        height, t_ns, np.random.default_rng((seed or 0, 3)), offset_sigma_hpa=0.0, sigma_hpa=noise
-    )
+    model = sensors.BarometerModel(offset_sigma_hpa=0.0, sigma_hpa=noise)
+    stream = sensors.barometer(height, t_ns, model, np.random.default_rng((seed or 0, 3)))
     session = made.session.replace(barometer=stream, device=Device(name="exact", vehicle="foot"))
     return replace(made, session=session)
 

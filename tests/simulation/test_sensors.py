@@ -82,7 +82,7 @@ def test_a_levelled_magnetometer_gives_the_heading():
     truth = motions.static(1.0).sample([0.0, 0.5])  # heading 40 deg
     field = np.array([0.0, 19.0, -45.0])
     rng = np.random.default_rng(0)
-    flux = sensors.magnetometer(truth, T_NS[:2], field, rng, hard_iron_sigma_ut=0.0, sigma_ut=0.0).field_ut
+    flux = sensors.magnetometer(truth, T_NS[:2], sensors.MagnetometerModel(10.0, 0.0, 0.0), field, rng).field_ut
     np.testing.assert_allclose(truth.nav_R_body @ flux[0], np.tile(field, (2, 1)), atol=1e-12)
     ahead, right = (truth.nav_R_body[0] @ axis for axis in ([0, 1, 0], [1, 0, 0]))
     assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(40.0)
@@ -97,7 +97,7 @@ def test_standard_pressure_is_the_table_of_the_standard_atmosphere():
 
 def test_a_barometer_keeps_height_differences():
     heights = np.linspace(100.0, 110.0, 5000)
-    reading = sensors.barometer(heights, T_NS[:5000], np.random.default_rng(3))
+    reading = sensors.barometer(heights, T_NS[:5000], sensors.BarometerModel(), np.random.default_rng(3))
     slope = np.polyfit(heights, reading.pressure_hpa, 1)[0]
     assert slope == pytest.approx(-0.1189, abs=0.001)  # hPa a metre near 100 m
 
@@ -105,8 +105,8 @@ def test_a_barometer_keeps_height_differences():
 def test_a_pressure_walks_with_its_density():
     height = np.full(N, 100.0)
     steady, walking = (
-        sensors.barometer(height, T_NS, np.random.default_rng(5), sigma_hpa=0.0, walk_hpa=walk).pressure_hpa
-        for walk in (0.0, 0.02)
+        sensors.barometer(height, T_NS, model, np.random.default_rng(5)).pressure_hpa
+        for model in (sensors.BarometerModel(sigma_hpa=0.0, walk_hpa=walk) for walk in (0.0, 0.02))
     )
     assert np.ptp(steady) == 0.0 and walking[0] == steady[0]
     for lag in (100, 1000):
@@ -117,8 +117,8 @@ def test_a_pressure_walks_with_its_density():
 def test_iron_on_the_way_disturbs_for_its_while_only():
     field = np.array([0.0, 19.0, -45.0])
     quiet, passed = (
-        sensors.magnetometer(rest(3000), T_NS[:3000], field, np.random.default_rng(6), disturbances=iron).field_ut
-        for iron in ((), ((10.0, 4.0, 25.0),))
+        sensors.magnetometer(rest(3000), T_NS[:3000], model, field, np.random.default_rng(6)).field_ut
+        for model in (sensors.MagnetometerModel(disturbances=iron) for iron in ((), ((10.0, 4.0, 25.0),)))
     )
     extra = np.linalg.norm(passed - quiet, axis=1)
     t = np.arange(3000) / 100

@@ -30,7 +30,7 @@ from smartnav_graph.session.streams import Imu, Magnetometer
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.recording import ORIGIN, YEAR
 from smartnav_graph.simulation.scenarios import simulate
-from smartnav_graph.simulation.sensors import PROFILES
+from smartnav_graph.simulation.sensors import PROFILES, MagnetometerModel
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 
 NOISE = DEVICE_CLASSES["mems"]  # in motion
@@ -256,9 +256,9 @@ def test_a_rest_of_a_calibrated_device_gives_the_magnetic_heading_within_three_d
     mag = sensors.magnetometer(
         recording.truth(t_ns),
         t_ns,
+        MagnetometerModel(hard_iron_sigma_ut=0.3),
         magnetic_field_ut(ORIGIN, YEAR),
         np.random.default_rng(seed),
-        hard_iron_sigma_ut=0.3,
     )
     session = recording.session.replace(magnetometer=mag)
     start = started(session, declination_deg=declination_deg())
