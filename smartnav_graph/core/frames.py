@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
 STANDARD_GRAVITY = 9.80665
 
@@ -49,7 +52,7 @@ class LocalFrame:
     origin: Origin
 
     @cached_property
-    def _pipeline(self) -> Any:
+    def _pipeline(self) -> Transformer:
         import pyproj
 
         o = self.origin

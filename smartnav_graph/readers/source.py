@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,7 +87,7 @@ def build_session(tables: Mapping[str, tuple[Path, Table]], repairs: tuple[str, 
             raise SessionError(file, "has no rows", "at least one row", stream=name)
         streams[name], counts = build_stream(STREAMS[name], columns, file, repairs)
         dropped |= {name: counts} if counts else {}
-    return Session(dropped=dropped, **header, **cast(dict[str, Any], streams))
+    return Session(dropped=dropped, **{**header, **streams})
 
 
 def example_file(name: str) -> Path:

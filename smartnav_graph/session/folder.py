@@ -47,8 +47,8 @@ def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
             shutil.copy2(source, folder / file)
 
 
-def _header(session: Session) -> dict[str, Any]:
-    header: dict[str, Any] = {"schema": SCHEMA}
+def _header(session: Session) -> dict[str, object]:
+    header: dict[str, object] = {"schema": SCHEMA}
     if session.gravity_m_s2 is not None:
         header["gravity_m_s2"] = session.gravity_m_s2
     if session.repairs:
@@ -108,7 +108,7 @@ def read_header(folder: Path) -> dict[str, Any]:
         raise error.located(path) if isinstance(error, SessionError) else error from error
 
 
-def _tuples(value: Any) -> Any:
+def _tuples(value: object) -> Any:
     if isinstance(value, dict):
         return {key: _tuples(item) for key, item in value.items()}
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
@@ -141,6 +141,6 @@ def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
             dropped |= {name: counts} if counts else {}
     header["repairs"] = wanted
     try:
-        return Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **header, **streams)  # type: ignore[arg-type]
+        return Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **{**header, **streams})
     except SessionError as error:
         raise error.located(folder / f"{error.stream}.parquet" if error.stream else folder) from error

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from smartnav_graph.core import frames
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS, seconds_since
@@ -112,7 +113,7 @@ class Session(Streams):
         starts = [int(stream.t_ns[0]) for stream in self.streams().values() if len(stream)]
         return min(starts, default=0)
 
-    def seconds(self, t_ns: Any) -> NDArray[np.float64]:
+    def seconds(self, t_ns: ArrayLike) -> Floats:
         """Seconds since `t0_ns`."""
         return seconds_since(t_ns, self.t0_ns)
 
@@ -121,7 +122,7 @@ class Session(Streams):
         """The local frame, where an origin is known."""
         return None if self.origin is None else LocalFrame(self.origin)
 
-    def nav_position(self, stream: Located) -> NDArray[np.float64]:
+    def nav_position(self, stream: Located) -> Floats:
         """Positions (n, 3) of a stream in nav metres."""
         if stream.enu is not None:
             return stream.enu
@@ -144,7 +145,7 @@ class Session(Streams):
         return 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
 
     @cached_property
-    def magnetic_field_ut(self) -> NDArray[np.float64] | None:
+    def magnetic_field_ut(self) -> Floats | None:
         """The Earth's field (3,) uT, ENU, at the origin; None without one."""
         return None if self.origin is None else frames.magnetic_field_ut(self.origin, self.year)
 
@@ -159,7 +160,7 @@ class Session(Streams):
         """Where `sensor` is mounted; the body origin where the session does not give it."""
         return self.sensors.get(sensor, Mount())
 
-    def lever_arms(self, stream: Positioned) -> NDArray[np.float64]:
+    def lever_arms(self, stream: Positioned) -> Floats:
         """Lever arm (n, 3) m in body axes of every row: of the sensor that a surveyed point names, else of the stream.
 
         Raises

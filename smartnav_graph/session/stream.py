@@ -81,11 +81,11 @@ class Stream:
         self._check_rows()
 
     @classmethod
-    def specs(cls) -> list[Field[Any]]:
+    def specs(cls) -> list[Field[object]]:
         """The fields that are file columns."""
         return [f for f in fields(cls) if "columns" in f.metadata]
 
-    def _checked(self, spec: Field[Any], value: ArrayLike) -> Column:
+    def _checked(self, spec: Field[object], value: ArrayLike) -> Column:
         names, kind = spec.metadata["columns"], spec.metadata["kind"]
         array: Column = np.array(value, dtype=_DTYPES[kind])
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))

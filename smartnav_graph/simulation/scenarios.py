@@ -5,8 +5,8 @@ With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min
 position measurements. That is also the initial state of a run without fixes, in batch and replay, so that errors are
 those of the whole way. The trolley rests for three minutes and stops ten times for ten seconds; at two corners of three
 it halts for 0.8 s before and after it is turned, too briefly to be detected, so that the listed halts fix its velocity
-and not its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False --standstill.zaru
-False``. A wrong boresight or camera clock, unknown to the session: ``replace(scenario,
+and not its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False
+--standstill.zaru False``. A wrong boresight or camera clock, unknown to the session: ``replace(scenario,
 camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
 """
 

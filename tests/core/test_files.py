@@ -1,4 +1,4 @@
-"""What stood before stands after a failure; nothing half-written is left."""
+"""What was there before a failure is there after it; nothing half-written is left."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_an_interrupt_leaves_the_old_and_no_leftovers(target, fault):
     assert read(path) == "old" and names(path.parent) == ["result"]
 
 
-def test_a_full_disk_is_told_and_leaves_the_old(target):
+def test_a_full_disk_is_reported_and_leaves_the_old(target):
     path, kind = target
     with pytest.raises(SessionError) as e:
         break_off(path, kind, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))

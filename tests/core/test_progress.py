@@ -1,4 +1,4 @@
-"""Progress: told in order, and on a terminal only."""
+"""Progress: reported in order, and on a terminal only."""
 
 import io
 import os
@@ -12,28 +12,28 @@ from smartnav_graph.core.progress import under, watched
 
 
 def collected():
-    told = []
-    return told, lambda *row: told.append(row)
+    reported = []
+    return reported, lambda *row: reported.append(row)
 
 
-def test_items_are_told_when_they_are_done():
-    told, progress = collected()
+def test_items_are_reported_when_they_are_done():
+    reported, progress = collected()
     assert list(watched("pass 1", ["a", "b"], progress)) == ["a", "b"]
-    assert told == [("pass 1", 0, 2), ("pass 1", 1, 2), ("pass 1", 2, 2)]
+    assert reported == [("pass 1", 0, 2), ("pass 1", 1, 2), ("pass 1", 2, 2)]
 
 
-def test_an_item_that_was_not_finished_is_not_told():
-    told, progress = collected()
+def test_an_item_that_was_not_finished_is_not_reported():
+    reported, progress = collected()
     for item in watched("replay", [1, 2, 3], progress):
         if item == 2:
             break
-    assert told == [("replay", 0, 3), ("replay", 1, 3)]
+    assert reported == [("replay", 0, 3), ("replay", 1, 3)]
 
 
 def test_stages_under_a_name():
-    told, progress = collected()
+    reported, progress = collected()
     under("run 2 of 6", progress)("replay", 5, 9)
-    assert told == [("run 2 of 6, replay", 5, 9)]
+    assert reported == [("run 2 of 6, replay", 5, 9)]
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_nearest_is_nearest(stamps, t):
 
 
 def signal(n: int = 6000, seed: int = 0, hertz: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps and six noisy axes of an honest sensor."""
+    """Stamps and six noisy axes of a real sensor."""
     rng = np.random.default_rng(seed)
     return ns_from_seconds(np.arange(n) / hertz) + 5 * NS, rng.standard_normal((n, 6)) * [3, 3, 3, 0.1, 0.1, 0.1]
 

@@ -89,7 +89,7 @@ def test_text_stays_text(tmp_path):
     assert control.extra["remark"].tolist() == ["wet", ""]
 
 
-def test_unknown_columns_are_kept_and_told(tmp_path, caplog):
+def test_unknown_columns_are_kept_and_reported(tmp_path, caplog):
     (tmp_path / "imu.csv").write_text(IMU_ROWS.replace("accel_z_m_s2", "accel_z_m_s2,lux").replace("9.81", "9.81,3"))
     assert readers.read(tmp_path).imu.extra["lux"].tolist() == [3.0, 3.0]
     assert "imu.csv: unknown column lux; kept" in caplog.text
@@ -143,7 +143,7 @@ def test_a_csv_that_is_no_stream_is_refused_not_overlooked(tmp_path):
         readers.read(tmp_path)
 
 
-def test_a_wrong_session_toml_is_told(tmp_path):
+def test_a_wrong_session_toml_is_reported(tmp_path):
     (tmp_path / "imu.csv").write_text(IMU_ROWS)
     (tmp_path / "session.toml").write_text("[device]\nforwards = '+x'\n")
     with pytest.raises(SessionError, match=r"session.toml: .*forwards"):

@@ -103,7 +103,7 @@ def test_the_csv_itself_is_recognised_and_a_session_round_trips(session, tmp_pat
     assert again.sensors == session.sensors and again.images.file[0] == ""
 
 
-def test_missing_extrinsics_are_told(tmp_path):
+def test_missing_extrinsics_are_reported(tmp_path):
     path = tmp_path / "eqvio.csv"
     lines = example_file("eqvio_processed_30s.csv").read_text().splitlines()[:200]
     path.write_text("\n".join(line for line in lines if "T_ci_qw" not in line))
@@ -182,7 +182,7 @@ def test_intrinsics_go_into_the_calibration(asl):
         ("458.654", "-458.654", "focal lengths and noise > 0"),
     ],
 )
-def test_broken_intrinsics_are_told(asl, old, new, part):
+def test_broken_intrinsics_are_reported(asl, old, new, part):
     (asl / "mav0" / "cam0" / "sensor.yaml").write_text(T_BS + INTRINSICS.replace(old, new))
     with pytest.raises((SessionError, CalibrationError), match=r"cam0/sensor\.yaml") as caught:
         readers.read(asl)

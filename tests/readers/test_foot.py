@@ -93,7 +93,7 @@ def test_a_walk_over_marked_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"timestamps_all": [[0.0, 0.005]]}, "timestamps_all has 2 stamps; expected 3, one an inertial row"),
         ({"gt": [[0.0, 0.0]]}, r"gt has shape \(1, 2\); expected \(3, 2\)"),
@@ -101,9 +101,9 @@ def test_a_walk_over_marked_points(tmp_path):
         ({"gt": None, "timestamps": [[0.0, 0.1, 0.2]], "strideIndex": [[3]]}, "strideIndex up to 3; expected row"),
     ],
 )
-def test_faulty_walks(tmp_path, changes, told):
+def test_faulty_walks(tmp_path, changes, message):
     savemat(tmp_path / "walk.mat", walk(**changes))
-    with pytest.raises(SessionError, match=f"walk.mat: {told}"):
+    with pytest.raises(SessionError, match=f"walk.mat: {message}"):
         readers.read(tmp_path / "walk.mat")
 
 

@@ -83,7 +83,7 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new, 1))
 
 
-def test_a_wrong_heading_is_told(short):
+def test_a_wrong_heading_is_reported(short):
     edit(short / IMU_FILE, "omegaX", "wx")
     with pytest.raises(SessionError, match="no known format"):
         readers.read(short)
@@ -93,7 +93,7 @@ def test_a_wrong_heading_is_told(short):
         assert part in str(caught.value)
 
 
-def test_a_missing_file_is_told(short):
+def test_a_missing_file_is_reported(short):
     (short / GNSS_FILE).unlink()
     with pytest.raises(SessionError, match=rf"{GNSS_FILE}: is missing"):
         readers.read(short, "gtsam-kitti")

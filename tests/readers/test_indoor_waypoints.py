@@ -70,7 +70,7 @@ def test_readings_of_any_age_are_noisy_where_the_phone_shakes(trace):
     assert readers.read(trace()).calibration.imu_noise.gyro_noise_density > 0.01  # two samples that leap
 
 
-def test_a_waypoint_just_before_the_sensors_is_used_and_told(trace):
+def test_a_waypoint_just_before_the_sensors_is_used_and_reported(trace):
     session = readers.read(trace())
     assert session.control.t_ns.tolist() == [1574668577179000000, 1574668577205000000]
     assert session.dropped == {"control": {"moved by at most 0.5 s to the first or last inertial sample": 1}}

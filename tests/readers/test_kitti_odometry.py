@@ -60,7 +60,7 @@ def test_a_saved_session_has_its_pictures(folder, tmp_path):
         assert (again.pictures / file).read_bytes() == (folder / "image_0" / file).read_bytes()
 
 
-def test_pictures_in_an_archive_are_told(folder):
+def test_pictures_in_an_archive_are_reported(folder):
     archive = shutil.make_archive(str(folder.parent / "packed"), "zip", folder.parent, "seq")
     session = readers.read(archive)
     assert session.pictures is None and len(session.images) == 2

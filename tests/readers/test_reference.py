@@ -123,7 +123,7 @@ def test_kitti_poses_become_body_poses_in_the_first_body_frame(tmp_path):
 def test_body_T_ref_moves_any_pose_to_the_body(tmp_path):
     nav_T_cam = np.eye(4)
     nav_T_cam[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ BODY_T_CAM[:3, :3]
-    nav_T_cam[:3, 3] = [0.3, 1.1, 0.7]  # the body stands at the origin and heads along +y
+    nav_T_cam[:3, 3] = [0.3, 1.1, 0.7]  # the body is at the origin and heads along +y
     x, y, z, w = Rotation.from_matrix(nav_T_cam[:3, :3]).as_quat()
     path = write(tmp_path, f"1 0.3 1.1 0.7 {x} {y} {z} {w}\n")
     reference = load_reference(path, body_T_ref=toml(tmp_path))

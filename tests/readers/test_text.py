@@ -1,4 +1,4 @@
-"""Delimited text: exact stamps, exact numbers, and faults told by file, row and value."""
+"""Delimited text: exact stamps, exact numbers, errors that name file, row and value."""
 
 import numpy as np
 import pytest

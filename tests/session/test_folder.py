@@ -234,18 +234,18 @@ def test_a_value_that_is_no_number(saved, bad):
 
 
 @pytest.mark.parametrize(
-    ("order", "row", "told", "counts"),
+    ("order", "row", "message", "counts"),
     [
         ([0, 1, 2, 2, 3, 4], 3, "step 0 ns", {"repeated stamps dropped": 1}),
         ([0, 2, 1, 3, 4, 5], 2, "step -10000001 ns", {"disordered rows sorted": 1}),
     ],
 )
-def test_duplicated_and_disordered_rows(saved, order, row, told, counts):
+def test_duplicated_and_disordered_rows(saved, order, row, message, counts):
     table = read_table(saved / "imu.parquet")
     write_table({k: v[order] for k, v in table.items()}, saved / "imu.parquet")
     refused(
         saved,
-        f"imu.parquet: t_ns not strictly increasing at row {row} ({told}",
+        f"imu.parquet: t_ns not strictly increasing at row {row} ({message}",
         "expected > 0",
         "--repair order",
         row=row,

@@ -109,9 +109,9 @@ def test_gyro_in_degrees(name):
     assert "looks like deg/s; multiply gyro by pi/180" in only(inspect(wrong), "warning")
 
 
-def test_gyro_of_a_car_in_degrees_is_told_from_gravity():
+def test_gyro_of_a_car_in_degrees_is_reported_from_gravity():
     wrong = scaled(make_imu(), gyro=180 / np.pi)
-    assert np.quantile(np.linalg.norm(wrong.gyro, axis=1), 0.999) < 35.0  # the peaks alone do not tell
+    assert np.quantile(np.linalg.norm(wrong.gyro, axis=1), 0.999) < 35.0  # the peaks alone are not enough
     assert "away from accel within 2 s" in only(inspect(make_session(imu=wrong)), "warning")
 
 
@@ -194,8 +194,8 @@ def test_missing_empty_and_short_streams():
 
 def test_no_absolute_sensor():
     health = inspect(make_session(gnss=None))
-    assert "no absolute sensor (gnss, control, pose_fixes)" in only(health, "warning")
-    assert "absolute sensor (gnss, control, pose_fixes)" in health.missing
+    assert "no absolute sensor (gnss, control, ranges, pose_fixes)" in only(health, "warning")
+    assert "absolute sensor (gnss, control, ranges, pose_fixes)" in health.missing
 
 
 def test_fixes_outside_the_span_are_counted():
@@ -239,12 +239,12 @@ def test_noise_of_fast_fixes_is_no_jump():
     assert inspect(make_session(gnss=fixes)).warnings() == []
 
 
-@pytest.mark.parametrize(("factor", "told"), [(1000, "0.1 Hz"), (0.001, "1e+05 Hz")])
-def test_stamps_in_another_unit(factor, told):
+@pytest.mark.parametrize(("factor", "rate"), [(1000, "0.1 Hz"), (0.001, "1e+05 Hz")])
+def test_stamps_in_another_unit(factor, rate):
     imu = make_imu()
     t_ns = T0 + np.rint((imu.t_ns - T0) * factor).astype(np.int64)
     warnings = inspect(make_session(imu=replace(imu, t_ns=t_ns))).warnings()
-    assert any(f"median rate {told} is outside" in warning for warning in warnings)
+    assert any(f"median rate {rate} is outside" in warning for warning in warnings)
 
 
 def test_unix_clock_in_milliseconds():
@@ -255,7 +255,7 @@ def test_unix_clock_in_milliseconds():
     assert inspect(early.replace(clock_epoch="boot")).warnings() == []
 
 
-def test_gaps_are_told_by_kind():
+def test_gaps_are_reported_by_kind():
     imu = make_imu()
     kept = np.r_[0:1000, 1200:3000]
     accel, gyro = np.array(imu.accel), np.array(imu.gyro)
@@ -269,12 +269,12 @@ def test_gaps_are_told_by_kind():
     assert [gap.kind for gap in health.gaps] == ["missing", "bridged"]
 
 
-def test_sigmas_heights_and_repairs_are_told():
+def test_sigmas_heights_and_repairs_are_reported():
     fixes = replace(make_fixes(), sigma=None)
     session = make_session(gnss=fixes, sensors={"gnss": Mount(frame="msl")}, dropped={"imu": {"rows sorted": 3}})
-    told = [str(finding) for finding in inspect(session).findings]
+    findings = [str(finding) for finding in inspect(session).findings]
     assert {finding.level for finding in inspect(session).findings} == {"info"}
-    assert told == [
+    assert findings == [
         "gnss: has no sigma columns; the default of the device class will be used",
         "gnss: heights are above mean sea level, not above the ellipsoid",
         "imu: 3 rows sorted",
@@ -307,8 +307,8 @@ real = pytest.mark.skipif(not DATASETS.is_dir(), reason=f"no real recordings at 
 def unit_alarms(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray, up: str = "+z") -> list[str]:
     rows = np.r_[True, np.diff(t) > 0]
     imu = Imu(t_ns=ns_from_seconds(t - t[0])[rows], gyro=gyro[rows], accel=accel[rows])
-    told = inspect(Session(imu=imu, gravity_m_s2=G, device=Device(up=up))).warnings()
-    return [warning for warning in told if "data gap" not in warning and "absolute" not in warning]
+    warnings = inspect(Session(imu=imu, gravity_m_s2=G, device=Device(up=up))).warnings()
+    return [warning for warning in warnings if "data gap" not in warning and "absolute" not in warning]
 
 
 @real

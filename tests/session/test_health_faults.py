@@ -18,7 +18,7 @@ from smartnav_graph.simulation.scenarios import simulate
 sound = cache(simulate)
 
 
-def told(session: Session) -> list[str]:
+def warnings_of(session: Session) -> list[str]:
     return inspect(session).warnings()
 
 
@@ -183,14 +183,14 @@ FAULTS = [
 
 @pytest.mark.parametrize("scenario", [CAR, WALK, "car-10min"])
 def test_sound_sessions_of_all_sensors_raise_no_alarm(scenario):
-    assert told(sound(scenario, seed=1)) == []
+    assert warnings_of(sound(scenario, seed=1)) == []
 
 
 @pytest.mark.parametrize(
     ("scenario", "fault", "found", "remedy"), FAULTS, ids=lambda v: v if isinstance(v, str) else ""
 )
 def test_a_planted_fault_is_named(scenario, fault, found, remedy):
-    warnings = told(fault(sound(scenario, seed=1)))
+    warnings = warnings_of(fault(sound(scenario, seed=1)))
     assert any(found in text and remedy in text for text in warnings), warnings
     stream = found.split(":")[0]
     if stream in ("imu", "gnss", "wheel", "velocity", "barometer", "magnetometer", "pose_fixes", "static"):
@@ -210,4 +210,4 @@ def test_sound_sessions_elsewhere_raise_no_alarm(lat, lon):
     moved = session.replace(origin=origin, magnetometer=None)
     for name, places in enu.items():
         moved = changed(moved, name, lla=moved.frame.lla_from_nav(places))
-    assert told(moved) == []
+    assert warnings_of(moved) == []

@@ -135,14 +135,14 @@ def test_a_sigma_must_be_positive(low, field):
     assert e.value.row == 4
 
 
-@pytest.mark.parametrize(("step", "told"), [(0, "step 0 ns"), (-2_000_000, "step -2000000 ns")])
-def test_stamps_must_increase(step, told):
+@pytest.mark.parametrize(("step", "found"), [(0, "step 0 ns"), (-2_000_000, "step -2000000 ns")])
+def test_stamps_must_increase(step, found):
     t = np.array(example(Imu).t_ns)
     t[3:] += t[2] + step - t[3]
     with pytest.raises(SessionError) as e:
         dataclasses.replace(example(Imu), t_ns=t)
     assert message(e).startswith(
-        f"imu: t_ns not strictly increasing at row 3 ({told}; 1 such rows in all); expected > 0"
+        f"imu: t_ns not strictly increasing at row 3 ({found}; 1 such rows in all); expected > 0"
     )
     assert "add --repair order to sort rows and drop repeated stamps, counted" in message(e)
     assert e.value.row == 3

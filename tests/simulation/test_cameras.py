@@ -1,4 +1,4 @@
-"""Simulated cameras: projection by hand, honest noise, faults as told, and what a session is not told."""
+"""Simulated cameras: projection by hand, correct noise, declared faults, and errors unknown to the session."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_inliers_miss_the_epipolar_geometry_by_the_noise():
     np.testing.assert_array_equal(spans, [1, 2])
 
 
-def test_outliers_are_marked_and_as_many_as_told():
+def test_outliers_are_marked_and_as_many_as_reported():
     session = recorded(faults=Faults(outliers=(0.2, 0.2)))
     bad = session.matches.extra["truth_inlier"] == 0
     assert bad.mean() == pytest.approx(0.2, abs=0.01)
@@ -128,14 +128,14 @@ def test_a_wrong_boresight_and_clock_are_in_the_images_and_not_in_the_session():
     r, baseline = misses(session, wrong)
     moved = baseline > 0.04
     assert (r[moved] ** 2).mean() == pytest.approx(1.0, abs=0.1)
-    told, _ = misses(session, EXACT)
-    assert (told[moved] ** 2).mean() > 1.5
+    assumed, _ = misses(session, EXACT)
+    assert (assumed[moved] ** 2).mean() > 1.5
     R, _ = wrong.poses(motions.in_a_room(12.0, np.random.default_rng(0)), np.array([5.0]))
     R0, _ = EXACT.poses(motions.in_a_room(12.0, np.random.default_rng(0)), np.array([5.0]))
     np.testing.assert_allclose(Rotation.from_matrix(R0[0].T @ R[0]).as_rotvec(degrees=True), [0.0, 0.5, 0.0], atol=1e-9)
 
 
-def test_a_known_offset_is_told():
+def test_a_known_offset_is_reported():
     camera = replace(EXACT.camera, time_offset_s=0.05)
     session = recorded(camera=camera)
     r, baseline = misses(session, replace(EXACT, camera=camera))

@@ -29,7 +29,7 @@ def drive():
     return Session(imu=s.imu, gnss=fix)
 
 
-def test_white_noise_is_added_and_told_in_the_sigma(drive):
+def test_white_noise_is_added_and_reported_in_the_sigma(drive):
     noisy = degrade(drive, Degrade(gnss_white=3.0), 0)
     np.testing.assert_allclose(noisy.gnss.enu.std(axis=0), [3, 3, 4.5], rtol=4 / np.sqrt(1200))
     np.testing.assert_array_equal(noisy.gnss.sigma, np.tile([3.0, 3.0, 4.5], (600, 1)))
@@ -38,7 +38,7 @@ def test_white_noise_is_added_and_told_in_the_sigma(drive):
     assert again.gnss.enu.std(axis=0)[0] == pytest.approx(5.0, rel=0.15)
 
 
-def test_correlated_noise_is_added_and_not_told(drive):
+def test_correlated_noise_is_added_and_not_reported(drive):
     noisy = degrade(drive, Degrade(gnss_white=3.0, gnss_gm=(4.0, 60.0)), 0)
     part = noisy.gnss.enu - degrade(drive, Degrade(gnss_white=3.0), 0).gnss.enu
     neighbours = (part[1:] * part[:-1]).sum() / (part**2).sum()

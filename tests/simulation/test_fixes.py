@@ -99,7 +99,7 @@ def test_fixes_are_those_of_the_antenna_outside_of_outages():
     np.testing.assert_allclose(FRAME.nav_from_lla(fix.lla), antenna[seen], atol=1e-6)
 
 
-def test_outliers_are_marked_and_not_told_in_the_sigma():
+def test_outliers_are_marked_and_not_reported_in_the_sigma():
     t = np.arange(60.0)
     truth = motions.static(60.0).sample(t)
     model = GnssModel(white_m=1.0, outliers=Outliers("isolated", 0.1, 50.0, 60.0))

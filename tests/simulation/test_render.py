@@ -118,7 +118,7 @@ def test_blur_smears_along_the_turn_and_only_along_it():
     assert alike[1] > 0.99 and alike[1] > max(alike[0], alike[2])
 
 
-def test_noise_is_white_and_as_told(painted, ray):
+def test_noise_is_white_and_as_reported(painted, ray):
     how = replace(CLEAN, noise=3.0)
     exact = 255 * render.picture(MODEL, TRAJECTORY, painted, ray, 7.0, how)
     (noisy,) = render.render_pictures(MODEL, TRAJECTORY, painted, np.array([7.0]), how, np.random.default_rng(2))

@@ -1,4 +1,4 @@
-"""Named sessions: honest noise, truth on exact stamps, the same seed the same session."""
+"""Named sessions: correct noise, truth on exact stamps, the same seed the same session."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_a_simulated_session_survives_the_disk(tmp_path, sessions):
     np.testing.assert_array_equal(back.reference.accel_bias, sessions["walk-60s"].reference.accel_bias)
 
 
-def test_an_unknown_scenario_is_told_with_the_known_ones():
+def test_an_unknown_scenario_is_reported_with_the_known_ones():
     with pytest.raises(ConfigError) as error:
         simulate("walk")
     assert str(error.value).startswith("simulate: scenario 'walk'; expected one of walk-60s, walk-10min, car-10min")

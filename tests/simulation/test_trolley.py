@@ -1,4 +1,4 @@
-"""The scenario trolley-20min: what it is made of stays as it is, and is what its figures are told for."""
+"""The scenario trolley-20min: its constants are frozen, and its figures are as declared."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_three_minutes_of_rest_and_ten_stops_of_ten_seconds(session):
     assert 1e-4 < np.sqrt((speed**2).mean()) < 1e-3  # m/s: nothing that people lean on is quite at rest
 
 
-def test_it_starts_at_the_origin_facing_north_and_is_told_no_position(session):
+def test_it_starts_at_the_origin_facing_north_and_is_reported_no_position(session):
     np.testing.assert_allclose(session.reference.enu[0], 0.0, atol=2e-3)
     start = Rotation.from_quat(session.reference.quat[0, [1, 2, 3, 0]]).magnitude()
     assert start < 1e-9 and not session.absolute()
@@ -138,7 +138,7 @@ def test_its_inliers_are_off_by_their_noise(session, truth):
     assert np.sqrt((miss**2).mean()) == pytest.approx(0.7, rel=0.02)  # px
 
 
-def test_a_wrong_boresight_and_clock_are_not_told(session):
+def test_a_wrong_boresight_and_clock_are_not_reported(session):
     wrong = replace(TROLLEY, seconds=230.0, camera=replace(TROLLEY.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))
     other = wrong(0)
     assert other.sensors == session.sensors and other.calibration == session.calibration

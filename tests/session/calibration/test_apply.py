@@ -65,7 +65,7 @@ def test_the_errors_are_taken_out_once(clean):
     once = prepare(with_errors(clean), Config())
     again = prepare(once.session, Config())
     np.testing.assert_array_equal(once.session.imu.accel, again.session.imu.accel)
-    assert once.calibration.imu_errors == ERRORS  # what the run is told to rest on
+    assert once.calibration.imu_errors == ERRORS  # what the run is based on
 
 
 def test_text_and_back():

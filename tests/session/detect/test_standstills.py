@@ -259,15 +259,15 @@ def test_stamps_of_keyframes():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"detector": "zvd"}, "detector = 'zvd'; expected one of shoe, are, amv"),
         ({"mounting": "hand"}, "mounting = 'hand'; expected one of auto, foot, body"),
         ({"floor_sigma": 0.0}, "floor_sigma = 0.0; expected > 0 m"),
     ],
 )
-def test_wrong_options(options, told):
-    with pytest.raises(ConfigError, match=told):
+def test_wrong_options(options, message):
+    with pytest.raises(ConfigError, match=message):
         StandstillConfig(**options)
 
 
@@ -275,7 +275,7 @@ def test_too_short_and_odd_recordings():
     for n in (2, 3, 30):
         samples = ride(motions.static(10.0)).take(slice(0, n))
         assert not found(samples).still.any()
-    slow = ride(motions.static(60.0), hertz=5.0)  # a tenth of a second without a sample tells nothing
+    slow = ride(motions.static(60.0), hertz=5.0)  # a tenth of a second without a sample says nothing
     assert not found(slow).still.any()
     assert found(ride(motions.static(60.0), hertz=10.0)).still.all()
     upside = replace(samples := ride(motions.static(10.0)), accel=1.2 * samples.accel)

@@ -1,4 +1,4 @@
-"""Steps: counted on motions of known cadence, told from other motion, and causal but for the declared look-ahead."""
+"""Steps: counted on motions of known cadence, separated from other motion, causal but for the look-ahead."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ def test_a_simulated_walk_steps_at_its_cadence_and_rests_where_it_rests():
 
 
 @pytest.mark.parametrize(("scenario", "least", "most"), [("walk-60s", 0.7, 1.0), ("phone-car-5min", 0.0, 0.02)])
-def test_a_walk_is_told_from_a_ride(scenario, least, most):
+def test_a_walk_is_reported_from_a_ride(scenario, least, most):
     session = simulation.scenarios.simulate(scenario)
     share = regular_share(find_steps(session.imu), float(session.seconds(session.imu.t_ns[-1])))
     assert least <= share <= most
