@@ -7,8 +7,7 @@ T_BS of the set's cam0. Stamps carry 17 digits, so they differ from the original
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,15 +50,14 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         "images": (path, _image_columns(features)),
         "tracks": (path, _track_columns(features)),
     }
-    meta = _meta(table)
     return build_session(
         tables,
         repairs,
-        calibration=Calibration(device=DEVICE, cameras={CAMERA: _camera(meta)}),
+        calibration=Calibration(device=DEVICE, cameras={CAMERA: _camera(table)}),
         device=Device(name=DEVICE, forward="+z", up="+x"),
         clock_epoch="unix",
         gravity_m_s2=GRAVITY,
-        sensors={CAMERA: _mount(meta)},
+        sensors={CAMERA: _mount(table)},
     )
 
 
@@ -90,36 +88,24 @@ def _track_columns(features: TextTable) -> Table:
     }
 
 
-@dataclass(frozen=True)
-class _Meta:
-    """The meta rows of a file."""
-
-    path: Path
-    values: Mapping[str, str]
-
-    def numbers(self, what: str, names: Sequence[str]) -> list[float]:
-        try:
-            return [float(self.values[name]) for name in names]
-        except (KeyError, ValueError) as error:
-            raise SessionError(self.path, f"{what}: {error}", f"meta rows {', '.join(names)}") from error
-
-
-def _meta(table: TextTable) -> _Meta:
+def _meta(table: TextTable, names: Sequence[str]) -> list[float]:
+    """Numbers of the meta rows."""
     rows = table.where("row_type", "meta")
-    return _Meta(rows.path, dict(zip(rows.texts("key"), rows.texts("value"), strict=True)))
+    values = dict(zip(rows.texts("key"), rows.texts("value"), strict=True))
+    try:
+        return [float(values[name]) for name in names]
+    except (KeyError, ValueError) as error:
+        raise SessionError(rows.path, f"camera: {error}", f"meta rows {', '.join(names)}") from error
 
 
-def _mount(meta: _Meta) -> Mount:
-    t, q = np.split(
-        np.array(meta.numbers("camera extrinsics", [f"T_ci_{n}" for n in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")])),
-        [3],
-    )
-    return mount(t, from_quaternion(q[None])[0])
+def _mount(table: TextTable) -> Mount:
+    pose = np.array(_meta(table, [f"T_ci_{name}" for name in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]))
+    return mount(pose[:3], from_quaternion(pose[None, 3:])[0])
 
 
-def _camera(meta: _Meta) -> Camera:
+def _camera(table: TextTable) -> Camera:
     """The points are undistorted already."""
-    fx, fy, cx, cy = meta.numbers("camera intrinsics", [f"camera_{n}" for n in ("fx", "fy", "cx", "cy")])
+    fx, fy, cx, cy = _meta(table, [f"camera_{name}" for name in ("fx", "fy", "cx", "cy")])
     return calibrated(*SIZE, fx, fy, cx, cy)
 
 

@@ -81,6 +81,10 @@ class Stream:
         self._check_rows()
 
     @classmethod
+    def _error(cls, found: str, expected: str, remedy: str = "", row: int | None = None) -> SessionError:
+        return SessionError(cls.NAME, found, expected, remedy, row=row, stream=cls.NAME)
+
+    @classmethod
     def specs(cls) -> list[Field[object]]:
         """The fields that are file columns."""
         return [f for f in fields(cls) if "columns" in f.metadata]
@@ -90,22 +94,15 @@ class Stream:
         array: Column = np.array(value, dtype=_DTYPES[kind])
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
         if array.shape != shape:
-            raise SessionError(
-                self.NAME, f"{spec.name} has shape {array.shape}", f"{shape}, one row a time stamp", stream=self.NAME
-            )
+            raise self._error(f"{spec.name} has shape {array.shape}", f"{shape}, one row a time stamp")
         if kind == "float":
             bad = np.isinf(array) if spec.metadata["nan"] else ~np.isfinite(array)
             if bad.any():
                 where = np.argwhere(bad)[0]
                 name = names[int(where[1]) if len(where) > 1 else 0]
-                raise SessionError(
-                    self.NAME,
-                    f"{name} is {array[tuple(where)]} at row {where[0]} ({int(bad.sum())} such values in all)",
-                    "finite numbers",
-                    "correct the row, or add --repair nan to drop such rows, counted",
-                    row=int(where[0]),
-                    stream=self.NAME,
-                )
+                found = f"{name} is {array[tuple(where)]} at row {where[0]} ({int(bad.sum())} such values in all)"
+                remedy = "correct the row, or add --repair nan to drop such rows, counted"
+                raise self._error(found, "finite numbers", remedy, int(where[0]))
         array.flags.writeable = False
         return array
 
@@ -114,45 +111,30 @@ class Stream:
         if self.ONE_OF and len(present) != 1:
             columns = " or ".join(", ".join(f.metadata["columns"]) for f in self.specs() if f.name in self.ONE_OF)
             found = "position columns missing" if not present else "both geodetic and local position columns"
-            raise SessionError(self.NAME, found, f"either {columns}", stream=self.NAME)
+            raise self._error(found, f"either {columns}")
         step = np.diff(self.t_ns)
         bad = np.flatnonzero(step <= 0 if self.UNIQUE_TIMES else step < 0)
         if len(bad):
             row = int(bad[0]) + 1
-            raise SessionError(
-                self.NAME,
-                f"t_ns not {'strictly ' if self.UNIQUE_TIMES else ''}increasing at row {row} "
-                f"(step {int(step[row - 1])} ns; {len(bad)} such rows in all)",
-                "> 0" if self.UNIQUE_TIMES else ">= 0",
-                "correct the file, or add --repair order to sort rows and drop repeated stamps, counted",
-                row=row,
-                stream=self.NAME,
-            )
+            strictly, rule = ("strictly ", "> 0") if self.UNIQUE_TIMES else ("", ">= 0")
+            count = f"(step {int(step[row - 1])} ns; {len(bad)} such rows in all)"
+            found = f"t_ns not {strictly}increasing at row {row} {count}"
+            remedy = "correct the file, or add --repair order to sort rows and drop repeated stamps, counted"
+            raise self._error(found, rule, remedy, row)
         early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
         if len(early):
             row = int(early[0])
             lead = int(self.t_ns[row] - np.asarray(self.arrival_ns)[row])
-            raise SessionError(
-                self.NAME,
-                f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)",
-                "arrival at or after the time of the measurement",
-                "correct the column, or leave it out",
-                row=row,
-                stream=self.NAME,
-            )
+            found = f"arrival_ns lies {lead} ns before t_ns at row {row} ({len(early)} such rows in all)"
+            rule = "arrival at or after the time of the measurement"
+            raise self._error(found, rule, "correct the column, or leave it out", row)
         for name in self.__dataclass_fields__:
             if "sigma" in name and getattr(self, name) is not None:
                 sigma = np.asarray(getattr(self, name))
                 low = np.argwhere(sigma <= 0)
                 if len(low):
-                    raise SessionError(
-                        self.NAME,
-                        f"{name} is {sigma[tuple(low[0])]} at row {low[0][0]}",
-                        "standard deviations > 0",
-                        "leave the value empty where it is not known",
-                        row=int(low[0][0]),
-                        stream=self.NAME,
-                    )
+                    found, remedy = f"{name} is {sigma[tuple(low[0])]} at row {low[0][0]}", "leave unknown values empty"
+                    raise self._error(found, "standard deviations > 0", remedy, int(low[0][0]))
 
     def take(self, rows: Mask | Indices | slice) -> Self:
         """The same stream with only these rows (mask, indices or slice)."""
@@ -191,13 +173,8 @@ class Stream:
                 values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
             elif found or spec.default is MISSING:
                 missing = [name for name in names if name not in table]
-                raise SessionError(
-                    cls.NAME,
-                    f"column {', '.join(missing)} is missing",
-                    f"columns {', '.join(names)}",
-                    f"the file has {', '.join(table) or 'no columns'}; rename or add the column",
-                    stream=cls.NAME,
-                )
+                remedy = f"the file has {', '.join(table) or 'no columns'}; rename or add the column"
+                raise cls._error(f"column {', '.join(missing)} is missing", f"columns {', '.join(names)}", remedy)
         return cls(**values, extra={name: np.asarray(table[name]) for name in table if name not in known})
 
 

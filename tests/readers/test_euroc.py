@@ -107,7 +107,7 @@ def test_missing_extrinsics_are_reported(tmp_path):
     path = tmp_path / "eqvio.csv"
     lines = example_file("eqvio_processed_30s.csv").read_text().splitlines()[:200]
     path.write_text("\n".join(line for line in lines if "T_ci_qw" not in line))
-    with pytest.raises(SessionError, match="camera extrinsics: 'T_ci_qw'; expected meta rows T_ci_tx"):
+    with pytest.raises(SessionError, match="camera: 'T_ci_qw'; expected meta rows T_ci_tx"):
         readers.read(path)
 
 

@@ -268,7 +268,11 @@ def test_repairs_that_the_session_asks_for_itself(saved):
 def test_a_sigma_that_is_not_positive(saved, low):
     rewrite(saved / "gnss.parquet", sigma_n_m=np.array([1, 1, low, 1, 1, 1.0]))
     refused(
-        saved, f"gnss.parquet: sigma is {low} at row 2", "expected standard deviations > 0", "leave the value", row=2
+        saved,
+        f"gnss.parquet: sigma is {low} at row 2",
+        "expected standard deviations > 0",
+        "leave unknown values",
+        row=2,
     )
 
 

@@ -129,8 +129,7 @@ def test_a_sigma_must_be_positive(low, field):
     with pytest.raises(SessionError) as e:
         dataclasses.replace(example(GnssFix), **{field: sigma})
     assert message(e) == (
-        f"gnss: {field} is {low} at row 4; expected standard deviations > 0; "
-        "leave the value empty where it is not known"
+        f"gnss: {field} is {low} at row 4; expected standard deviations > 0; leave unknown values empty"
     )
     assert e.value.row == 4
 
