@@ -1,4 +1,4 @@
-"""One clock a session: int64 nanoseconds. Decimal text -> t_ns, association, interpolation, gaps.
+"""One clock per session: int64 nanoseconds. Decimal text -> t_ns, association, interpolation, gaps.
 
 Nothing here knows sensors; arrays go in, arrays come out.
 """

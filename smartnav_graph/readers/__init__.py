@@ -1,4 +1,4 @@
-"""Foreign logs -> Session. One module a format; `READERS` names them all.
+"""Foreign logs -> Session. One module per format; `READERS` lists them.
 
 A reader changes units and the sign of specific force, never axes, and keeps the source's own clock.
 """

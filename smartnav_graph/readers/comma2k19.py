@@ -96,7 +96,7 @@ def _times(path: Path, count: int) -> Times:
     """Stamps as exact as the floats that hold them: through their shortest decimal text."""
     seconds = _load(path)
     if seconds.shape != (count,):
-        raise SessionError(path, f"has shape {seconds.shape}", f"({count},), one stamp a value")
+        raise SessionError(path, f"has shape {seconds.shape}", f"({count},), one stamp per value")
     bad = np.flatnonzero(~np.isfinite(seconds))
     if len(bad):
         row = int(bad[0])

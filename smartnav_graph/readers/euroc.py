@@ -73,7 +73,7 @@ def _imu_columns(path: Path) -> Table:
 
 
 def _image_columns(root: Path, cameras: list[str]) -> Table:
-    """One row an image of any camera, by time; file names count from the ASL folder."""
+    """One row per image of any camera, by time; file names are relative to the ASL folder."""
     t_ns: list[Times] = []
     files: list[str] = []
     names: list[str] = []

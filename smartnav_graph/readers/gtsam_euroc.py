@@ -68,7 +68,7 @@ def _imu_columns(table: TextTable) -> Table:
 
 
 def _image_columns(features: TextTable) -> Table:
-    """One row a frame. There are tracks but no pictures: the file name stays empty."""
+    """One row per frame. There are tracks but no pictures: the file name stays empty."""
     frames, first = np.unique(features.ints("frame_idx"), return_index=True)
     return {
         "t_ns": features.times("t_abs")[first],

@@ -1,7 +1,7 @@
 """Traces of the Indoor Location Competition 2.0 (Microsoft Research, XYZ10): a phone in hand, waypoints on a plan.
 
 Lines of text, tab separated: Unix time in ms, type, values. Read are TYPE_ACCELEROMETER (specific force, m/s^2),
-TYPE_GYROSCOPE (rad/s, the system's bias taken off) and TYPE_WAYPOINT (x right, y up, metres on the plan). Phone axes:
+TYPE_GYROSCOPE (rad/s, less the system's bias) and TYPE_WAYPOINT (x right, y up, metres on the plan). Phone axes:
 x right, y top, z out of the screen. Nothing ties the plan to north: magnetic field and rotation vector are left.
 
 A waypoint is a place tapped on the map: `LABEL_SIGMA`. The floor is flat and the phone is carried at
@@ -99,7 +99,7 @@ def _records(path: Path) -> dict[str, list[list[str]]]:
                 path,
                 f"line {number} has {len(values)} values behind {kind}",
                 f"{count}, and an accuracy after those of a sensor",
-                "put each record on a line of its own",
+                "put each record on a separate line",
                 row=number,
             )
         rows[kind].append([t, *values[:count]])

@@ -85,7 +85,7 @@ def _poses(path: Path, count: int) -> Table:
 
 def _check_count(path: Path, rows: int, count: int) -> None:
     if rows != count:
-        raise SessionError(path, f"has {rows} rows", f"{count}, one a picture", "give the whole sequence")
+        raise SessionError(path, f"has {rows} rows", f"{count}, one per picture", "give the whole sequence")
 
 
 def _camera(path: Path, picture: Path) -> Camera:

@@ -50,7 +50,7 @@ def _times(path: Path, variables: Table, name: str, count: int) -> Times:
     """Stamps of seconds since the recording's start."""
     seconds = np.ravel(variables[name]) if name in variables else np.zeros(0)
     if seconds.shape != (count,):
-        raise SessionError(path, f"{name} has {len(seconds)} stamps", f"{count}, one an inertial row")
+        raise SessionError(path, f"{name} has {len(seconds)} stamps", f"{count}, one per inertial row")
     return ns_from_seconds(seconds)
 
 

@@ -43,7 +43,7 @@ def load_reference(
     Parameters
     ----------
     path : the reference, see the table above
-    times : KITTI poses only: one time in seconds a row; its clock starts at 0, so the offset to the session's clock
+    times : KITTI poses only: one time in seconds per row; its clock starts at 0, so the offset to the session's clock
         must be given (or searched) where the two are compared
     body_T_ref : TOML with one 4x4 matrix ``body_T_<name>``: the pose, in body axes, of the frame whose poses the file
         holds. The result is the body's pose, nav_T_body = nav_T_ref * inv(body_T_ref). KITTI poses are camera poses
@@ -162,7 +162,7 @@ def _named_times(table: TextTable, name: str) -> Times:
 
 def _kitti(path: Path, times: str | Path | None, body_T_ref: str | Path | None) -> Table:
     for option, value, what in (
-        ("--times", times, "a file with one time in seconds a row"),
+        ("--times", times, "a file with one time in seconds per row"),
         ("--body-T-ref", body_T_ref, "a TOML file with body_T_cam, the camera's pose in the body"),
     ):
         if value is None:

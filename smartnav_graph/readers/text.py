@@ -139,7 +139,7 @@ def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
     ----------
     path : the file; UTF-8
     names : column names, for files without a heading or with a heading behind #; by default the first line names the
-        columns (a leading # is taken off)
+        columns (a leading # is removed)
 
     Further lines that start with # are comments. Row numbers in errors count data rows from zero.
 

@@ -1,4 +1,4 @@
-"""Phones under motion capture (Tyrex, Inria): one folder a recording, text files of one sensor each.
+"""Phones under motion capture (Tyrex, Inria): one folder per recording, text files of one sensor each.
 
 Michel, Geneves, Fourati, Layaida (2017), On attitude estimation with smartphones, PerCom. Phone axes: x right, y top,
 z out of the screen.
@@ -10,7 +10,7 @@ marked by          record.properties          description.txt (BootTime)
 stamps             s since the log began      s since the phone was booted, kept
 accelerometer      m/s^2                      g, with the opposite sign: times -9.80665
 gyroscope          rad/s, as read, then the   rad/s, as read
-                   system's bias: taken off
+                   system's bias: subtracted
 magnetometer       uT, the same               uT, as read (offsets of hundreds of uT)
 own attitude       rotation-vector: x y z w   attitude: w x y z, zero of heading unknown
 =================  =========================  ===========================================================
@@ -193,7 +193,7 @@ def _truth(path: Path, folder: Path, system: System) -> tuple[Table, int]:
 
 
 def _rigid_body(path: Path) -> tuple[Floats, Floats, float]:
-    """Positions (3, n) mm, rotation matrices (9, n), frames a second; the one variable is named after the recording."""
+    """Positions (3, n) mm, rotation matrices (9, n), frames per second; the name of the only variable varies."""
     variables = read_mat(path)
     try:
         capture = next(iter(variables.values()))[0, 0]

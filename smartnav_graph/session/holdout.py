@@ -1,4 +1,4 @@
-"""Withheld rows: kept from the smoother on purpose, to be scored afterwards."""
+"""Withheld rows: not given to the smoother, but scored afterwards."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Stream:
         array: Column = np.array(value, dtype=_DTYPES[kind])
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
         if array.shape != shape:
-            raise self._error(f"{spec.name} has shape {array.shape}", f"{shape}, one row a time stamp")
+            raise self._error(f"{spec.name} has shape {array.shape}", f"{shape}, one row per time stamp")
         if kind == "float":
             bad = np.isinf(array) if spec.metadata["nan"] else ~np.isfinite(array)
             if bad.any():

@@ -1,4 +1,4 @@
-"""The streams of a session: one dataclass a kind of sensor, one field of `Streams` each."""
+"""The streams of a session: one dataclass per kind of sensor, one field of `Streams` each."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class WheelSpeed(Stream):
 
 @dataclass(frozen=True, kw_only=True)
 class Images(Stream):
-    """One row an image; files lie in the session's images/ folder."""
+    """One row per image; files lie in the session's images/ folder."""
 
     NAME: ClassVar[str] = "images"
     LABEL: ClassVar[Label] = Label("Images", "image", "images")

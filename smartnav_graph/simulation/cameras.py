@@ -33,7 +33,7 @@ Range = tuple[float, float]
 
 # Optical axes (x right, y down, z forward) of a camera that looks along +y of a body with z up.
 LOOKING_AHEAD = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-# Times a rolling shutter's row is found again at the pose of its own time: 1 rad/s and 30 ms move it by 1 % of itself.
+# Times a rolling shutter's row is found again at the pose of its time: 1 rad/s and 30 ms move it by 1 % of itself.
 _ROW_PASSES = 3
 
 
@@ -272,7 +272,7 @@ def _pair(
 def _tracks(
     model: SimulatedCamera, views: Sequence[Projection], jumps: Floats, t_ns: Times, rng: np.random.Generator
 ) -> Tracks | None:
-    """Tracks that live until their point is out of sight or lost; new ones fill the frame to its number."""
+    """Tracks that end where their point is lost or not visible; new ones fill the frame to its number."""
     seen = list(_followed(model, views, rng))
     image = np.repeat(np.arange(len(views)), [len(ids) for ids, _ in seen])
     if not len(image):

@@ -131,7 +131,7 @@ def outlier_errors(t_ns: Times, outliers: Outliers, rng: np.random.Generator) ->
 
 
 def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np.random.Generator) -> GnssFix:
-    """Fixes of the antenna at `truth` (one row a fix); the sigma columns hold the white part only.
+    """Fixes of the antenna at `truth` (one row per fix); the sigma columns hold the white part only.
 
     Column `is_outlier` (kept in `extra`) marks outliers with 1.
     """
@@ -161,7 +161,7 @@ def gnss(truth: Truth, t_ns: Times, model: GnssModel, frame: LocalFrame, rng: np
 def simulate_pose_fixes(
     truth: Truth, t_ns: Times, model: PoseFixModel, frame: LocalFrame, rng: np.random.Generator
 ) -> PoseFix:
-    """Pose fixes of the body at `truth` (one row a fix): the attitude is Exp(error) nav_R_body, error in nav axes."""
+    """Pose fixes of the body at `truth` (one row per fix): the attitude is Exp(error) nav_R_body, error in nav axes."""
     n = len(t_ns)
     enu = truth.nav_t_body + model.sigma_m * rng.standard_normal((n, 3))
     turn = exp(model.sigma_rad * rng.standard_normal((n, 3)))
@@ -181,7 +181,7 @@ def simulate_pose_fixes(
 def control(
     truth: Truth, t_ns: Times, names: Sequence[str], sigma_m: float, frame: LocalFrame, rng: np.random.Generator
 ) -> ControlPoint:
-    """Surveyed points under the device at `truth` (one row a point), off by `sigma_m` per axis."""
+    """Surveyed points under the device at `truth` (one row per point), off by `sigma_m` per axis."""
     n = len(t_ns)
     enu = truth.nav_t_body + sigma_m * rng.standard_normal((n, 3))
     sigma = np.full((n, 3), sigma_m)

@@ -9,7 +9,7 @@ import numpy as np
 
 from smartnav_graph.simulation.trajectory import Eight, Leg, Legs, Sway, Trajectory
 
-# A hand-held phone at 1.35 m/s, 1.9 steps a second: up and down with the step, sideways and roll with the stride.
+# A hand-held phone at 1.35 m/s, 1.9 steps per second: up and down with the step, sideways and roll with the stride.
 _STEPS = (
     Sway(hertz=1.9, shift=(0.0, 0.008, 0.018), tilt=(0.0, 0.03, 0.0)),
     Sway(hertz=0.95, shift=(0.015, 0.0, 0.0), tilt=(0.03, 0.0, 0.04), phase=0.7),
@@ -66,7 +66,7 @@ def slip(rng: np.random.Generator, sigma: float, axes: tuple[int, ...] = (0, 2))
     """Violation of the constraints of a vehicle: side and vertical speeds of `sigma` m/s (root mean square at the sway
     speed).
 
-    Three slow sines a direction with phases of their own: samples a second apart are nearly independent.
+    Three slow sines per direction with different phases: samples a second apart are nearly independent.
     """
     waves = []
     for axis in axes:

@@ -75,7 +75,7 @@ class Scenario:
         return _record(self, seed, calibrated)
 
 
-# Every purpose has random numbers of its own: a new sensor is added at the end and leaves the others as they were.
+# Every purpose has separate random numbers: a new sensor is added at the end and does not change the others.
 PURPOSES = (
     *("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes"),
     *("scene", "camera", "texture", "pictures", "ranges"),
@@ -83,7 +83,7 @@ PURPOSES = (
 
 
 @dataclass(frozen=True)
-class _Ride:
+class _Motion:
     """One motion sampled at the inertial stamps, and the random numbers of every purpose."""
 
     trajectory: Trajectory
@@ -104,27 +104,27 @@ class _Ride:
         return slice(None, None, round(RATE_HZ / rate_hz))
 
 
-def _ride(scenario: Scenario, seed: int) -> _Ride:
+def _motion(scenario: Scenario, seed: int) -> _Motion:
     trajectory = scenario.motion(scenario.seconds, np.random.default_rng((seed, 0)))
     t = np.arange(round(scenario.seconds * RATE_HZ)) / RATE_HZ
-    return _Ride(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
+    return _Motion(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
 
 
 def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
-    ride = _ride(scenario, seed)
-    trajectory, t = ride.trajectory, ride.t
+    motion = _motion(scenario, seed)
+    trajectory, t = motion.trajectory, motion.t
     profile = PROFILES[scenario.profile]
-    imu, biases = sensors.imu(ride.truth, ride.t_ns, profile.noise, _gravity(), ride.rng("imu"))
+    imu, biases = sensors.imu(motion.truth, motion.t_ns, profile.noise, _gravity(), motion.rng("imu"))
     streams: dict[str, Stream | None] = {
-        "gnss": _gnss(ride, scenario.gnss),
-        "control": _control(ride) if scenario.control else None,
-        "pose_fixes": _pose_fixes(ride, scenario.pose_fixes),
-        "ranges": _ranges(ride, scenario.ranges),
-        **_slow_sensors(ride, scenario),
-        **_camera(ride, scenario.camera),
+        "gnss": _gnss(motion, scenario.gnss),
+        "control": _control(motion) if scenario.control else None,
+        "pose_fixes": _pose_fixes(motion, scenario.pose_fixes),
+        "ranges": _ranges(motion, scenario.ranges),
+        **_slow_sensors(motion, scenario),
+        **_camera(motion, scenario.camera),
     }
     rows = [np.arange(0, len(t), SLOW_ROWS)]
-    rows += [np.searchsorted(ride.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
+    rows += [np.searchsorted(motion.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
     mounts = {} if scenario.gnss is None else {"gnss": Mount(body_t=scenario.gnss.body_t_antenna)}
     if scenario.ranges is not None:
         mounts["ranges"] = Mount(body_t=scenario.ranges.body_t_sensor)
@@ -137,51 +137,53 @@ def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
         sensors=mounts,
         calibration=_calibration(scenario) if calibrated else None,
         imu=imu,
-        static=_static(trajectory, ride.t_ns, scenario.rest_sigma_m_s),
-        reference=reference(ride.truth, ride.t_ns, biases, np.unique(np.concatenate(rows))),
+        static=_static(trajectory, motion.t_ns, scenario.rest_sigma_m_s),
+        reference=reference(motion.truth, motion.t_ns, biases, np.unique(np.concatenate(rows))),
         **streams,  # type: ignore[arg-type]
     )
 
 
-def _gnss(ride: _Ride, model: GnssModel | None) -> GnssFix | None:
+def _gnss(motion: _Motion, model: GnssModel | None) -> GnssFix | None:
     if model is None:
         return None
-    every = ride.rows(model.rate_hz)
-    truth, t_ns = ride.truth.take(every), ride.t_ns[every]
+    every = motion.rows(model.rate_hz)
+    truth, t_ns = motion.truth.take(every), motion.t_ns[every]
     if model.offset_s:
-        valid = ride.t[every] + model.offset_s
-        inside = (valid >= 0.0) & (valid <= ride.trajectory.duration)
-        truth, t_ns = ride.trajectory.sample(valid[inside]), t_ns[inside]
-    return fixes.gnss(truth, t_ns, model, ride.frame, ride.rng("gnss"))
+        valid = motion.t[every] + model.offset_s
+        inside = (valid >= 0.0) & (valid <= motion.trajectory.duration)
+        truth, t_ns = motion.trajectory.sample(valid[inside]), t_ns[inside]
+    return fixes.gnss(truth, t_ns, model, motion.frame, motion.rng("gnss"))
 
 
-def _control(ride: _Ride) -> ControlPoint:
-    at = _stop_rows(ride.trajectory, ride.t)
+def _control(motion: _Motion) -> ControlPoint:
+    at = _stop_rows(motion.trajectory, motion.t)
     names = [f"P{i}" for i in range(len(at))]
-    rng = ride.rng("control")
-    return fixes.control(ride.truth.take(at), ride.t_ns[at], names, CONTROL_SIGMA_M, ride.frame, rng)
+    rng = motion.rng("control")
+    return fixes.control(motion.truth.take(at), motion.t_ns[at], names, CONTROL_SIGMA_M, motion.frame, rng)
 
 
-def _pose_fixes(ride: _Ride, model: PoseFixModel | None) -> PoseFix | None:
+def _pose_fixes(motion: _Motion, model: PoseFixModel | None) -> PoseFix | None:
     if model is None:
         return None
-    at = np.searchsorted(ride.t, np.arange(model.first_s, ride.t[-1], model.every_s) - 1e-9)
-    return fixes.simulate_pose_fixes(ride.truth.take(at), ride.t_ns[at], model, ride.frame, ride.rng("pose_fixes"))
+    at = np.searchsorted(motion.t, np.arange(model.first_s, motion.t[-1], model.every_s) - 1e-9)
+    return fixes.simulate_pose_fixes(
+        motion.truth.take(at), motion.t_ns[at], model, motion.frame, motion.rng("pose_fixes")
+    )
 
 
-def _ranges(ride: _Ride, model: RangeModel | None) -> Ranges | None:
+def _ranges(motion: _Motion, model: RangeModel | None) -> Ranges | None:
     if model is None:
         return None
-    every = ride.rows(model.rate_hz)
-    return ranges.ranges(ride.truth.take(every), ride.t_ns[every], model, ride.frame, ride.rng("ranges"))
+    every = motion.rows(model.rate_hz)
+    return ranges.ranges(motion.truth.take(every), motion.t_ns[every], model, motion.frame, motion.rng("ranges"))
 
 
-def _camera(ride: _Ride, model: SimulatedCamera | None) -> dict[str, Stream | None]:
+def _camera(motion: _Motion, model: SimulatedCamera | None) -> dict[str, Stream | None]:
     if model is None:
         return {}
-    scene, every = model.scene(ride.rng("scene")), ride.rows(model.rate_hz)
-    t_ns, t = ride.t_ns[every], ride.t[every]
-    taken = cameras.take(model, ride.trajectory, t_ns, t, scene, ride.rng("camera"))
+    scene, every = model.scene(motion.rng("scene")), motion.rows(model.rate_hz)
+    t_ns, t = motion.t_ns[every], motion.t[every]
+    taken = cameras.take(model, motion.trajectory, t_ns, t, scene, motion.rng("camera"))
     return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
 
 
@@ -208,13 +210,13 @@ def simulate_to_folder(
 
 
 def shots(scenario: Scenario, seed: int) -> Iterator[render.Grey]:
-    """The pictures (h, w) of a scenario that renders some, one an image of its session."""
-    model, ride = scenario.camera, _ride(scenario, seed)
+    """The pictures (h, w) of a scenario that renders some, one per image of its session."""
+    model, motion = scenario.camera, _motion(scenario, seed)
     if model is None or model.pictures is None:
         raise ConfigError("simulate", f"{scenario.name} renders no pictures", "a scenario whose camera does")
-    painted = render.Painted.of(model.scene(ride.rng("scene")), model.pictures, ride.rng("texture"))
-    t = ride.t[ride.rows(model.rate_hz)]
-    yield from render.render_pictures(model, ride.trajectory, painted, t, model.pictures, ride.rng("pictures"))
+    painted = render.Painted.of(model.scene(motion.rng("scene")), model.pictures, motion.rng("texture"))
+    t = motion.t[motion.rows(model.rate_hz)]
+    yield from render.render_pictures(model, motion.trajectory, painted, t, model.pictures, motion.rng("pictures"))
 
 
 def scenario_constants(scenario: Scenario) -> dict[str, object]:
@@ -230,23 +232,23 @@ def _flat(name: str, value: object) -> dict[str, object]:
     return {} if value is None else {name: getattr(value, "__name__", value)}
 
 
-def _slow_sensors(ride: _Ride, scenario: Scenario) -> dict[str, Stream]:
+def _slow_sensors(motion: _Motion, scenario: Scenario) -> dict[str, Stream]:
     """The streams that make no keyframes."""
     made: dict[str, Stream] = {}
     if (mag := scenario.magnetometer) is not None:
-        rows, rng = ride.rows(mag.rate_hz), ride.rng("magnetometer")
+        rows, rng = motion.rows(mag.rate_hz), motion.rng("magnetometer")
         field = frames.magnetic_field_ut(ORIGIN, YEAR)
-        made["magnetometer"] = sensors.magnetometer(ride.truth.take(rows), ride.t_ns[rows], mag, field, rng)
+        made["magnetometer"] = sensors.magnetometer(motion.truth.take(rows), motion.t_ns[rows], mag, field, rng)
     if (baro := scenario.barometer) is not None:
-        rows, rng = ride.rows(baro.rate_hz), ride.rng("barometer")
-        height = ORIGIN.height_m + ride.truth.nav_t_body[rows, 2]
-        made["barometer"] = sensors.barometer(height, ride.t_ns[rows], baro, rng)
+        rows, rng = motion.rows(baro.rate_hz), motion.rng("barometer")
+        height = ORIGIN.height_m + motion.truth.nav_t_body[rows, 2]
+        made["barometer"] = sensors.barometer(height, motion.t_ns[rows], baro, rng)
     if (model := scenario.wheel) is not None:
-        rows, rng = ride.rows(model.rate_hz), ride.rng("wheel")
-        made["wheel"] = sensors.wheel(ride.trajectory.speed(ride.t[rows]), ride.t_ns[rows], model, rng)
+        rows, rng = motion.rows(model.rate_hz), motion.rng("wheel")
+        made["wheel"] = sensors.wheel(motion.trajectory.speed(motion.t[rows]), motion.t_ns[rows], model, rng)
     if (model := scenario.velocity) is not None:
-        rows, rng = ride.rows(model.rate_hz), ride.rng("velocity")
-        made["velocity"] = sensors.velocity(ride.truth.take(rows), ride.t_ns[rows], model, rng)
+        rows, rng = motion.rows(model.rate_hz), motion.rng("velocity")
+        made["velocity"] = sensors.velocity(motion.truth.take(rows), motion.t_ns[rows], model, rng)
     return made
 
 

@@ -1,7 +1,7 @@
 """Pictures of a scene: textured faces, seen ray by ray, with rolling shutter, motion blur and sensor noise.
 
 Every pixel looks along one ray, taken through the camera's distortion; the nearest face it meets gives its brightness.
-With a rolling shutter each row has the pose of its own time. Blur is the mean of pictures over the exposure, whose
+With a rolling shutter each row has the pose of its time. Blur is the mean of pictures over the exposure, whose
 middle is the time of the row. Textures are noise of several scales with sharp edges between patches, so that detectors
 find corners near and far; they are drawn anew for each seed.
 """

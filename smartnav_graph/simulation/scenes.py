@@ -70,7 +70,7 @@ class Scene:
         return self._unhidden(centre, rows[ahead])
 
     def _unhidden(self, centre: Floats, rows: Indices) -> Indices:
-        """Those without another face on the way to them; what is closed hides by a face seen from here."""
+        """Those without another face in between; a closed box hides by one of its visible faces."""
         height = np.einsum("fi,fi->f", centre - self.corner, self.normal)
         middle, size = self.corner + (self.u + self.v) / 2, np.linalg.norm(self.u + self.v, axis=1) / 2
         away = np.linalg.norm(middle - centre, axis=1) - size
@@ -88,7 +88,7 @@ class Scene:
 
 
 def make_scene(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) -> Scene:
-    """The faces of the boxes, with `per_m2` points a square metre scattered evenly where nothing covers them."""
+    """The faces of the boxes, with `per_m2` points per square metre scattered evenly where nothing covers them."""
     faces = np.concatenate([_faces(box) for box in boxes])
     corner, u, v = faces[:, 0], faces[:, 1], faces[:, 2]
     area = np.linalg.norm(np.cross(u, v), axis=1)
@@ -127,7 +127,7 @@ def _faces(box: Box) -> Floats:
 @dataclass(frozen=True)
 class FurnishedRoom:
     """A room of `size_m` (east, north, up) about `centre_m`, with five pieces of furniture along its walls and `per_m2`
-    points a square metre."""
+    points per square metre."""
 
     size_m: tuple[float, float, float] = (8.0, 6.0, 3.0)
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -149,7 +149,7 @@ class CorridorGrid:
     blocks of rooms between them, and cupboards along the outer walls.
 
     The crossing at `origin` (east, north) of the grid lies at the nav origin; floor and ceiling are at `floor_m` and
-    `ceiling_m`. `per_m2` points a square metre.
+    `ceiling_m`. `per_m2` points per square metre.
     """
 
     nodes: tuple[int, int]

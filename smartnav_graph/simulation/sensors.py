@@ -88,8 +88,8 @@ def specific_force(truth: Truth, gravity: float) -> Floats:
 
     A device lying flat at rest reads +gravity on z.
     """
-    lifted = truth.nav_a_body + np.array([0.0, 0.0, gravity])
-    return rotate_back(truth.nav_R_body, lifted)
+    force = truth.nav_a_body + np.array([0.0, 0.0, gravity])
+    return rotate_back(truth.nav_R_body, force)
 
 
 def random_walk(t_ns: Times, start_sigma: float, walk: float, rng: np.random.Generator) -> Floats:
@@ -124,7 +124,7 @@ def imu(
 class MagnetometerModel:
     """A magnetometer: `rate_hz`, white sigma a sample, sigma of the constant hard iron (uT, body axes), disturbances.
 
-    A disturbance (start s, length s, size uT) is a horizontal field in a random direction that swells and fades as iron
+    A disturbance (start s, length s, size uT) is a horizontal field in a random direction that rises and falls as iron
     is passed.
     """
 
@@ -161,8 +161,8 @@ def magnetometer(
     field = field + model.sigma_ut * rng.standard_normal(field.shape)
     for start, length, size in model.disturbances:
         angle = rng.uniform(0.0, 2 * np.pi)
-        swell = size * np.sin(np.pi * np.clip((truth.t - start) / length, 0.0, 1.0)) ** 2
-        iron = swell[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
+        size_ut = size * np.sin(np.pi * np.clip((truth.t - start) / length, 0.0, 1.0)) ** 2
+        iron = size_ut[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
         field = field + rotate_back(truth.nav_R_body, iron)
     return Magnetometer(t_ns=t_ns, field_ut=field)
 

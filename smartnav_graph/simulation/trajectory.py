@@ -1,11 +1,11 @@
 """Analytic motions with exact position, velocity, acceleration, attitude and body rate.
 
-A motion is a ride along the body's own forward direction plus a sway::
+A motion is a way along the body's forward direction plus a sway::
 
     nav_R_way  = Rz(psi) Rx(slope)                        psi counter-clockwise from north about up
     velocity   = speed * nav_R_way e_y                    so a car's side and vertical speed are exactly zero
     nav_R_body = nav_R_way Rz(yaw) Rx(pitch) Ry(roll)     how the device is held
-    nav_t_body = way + carried                            where it sits, in level axes (right, ahead, up)
+    nav_t_body = way + carried                            its place, in level axes (right, ahead, up)
     sway       = envelope * sum of sines, in level axes and in the held angles
 
 The envelope is speed / reference speed, so that a device at rest does not sway. Speed, psi and slope are piecewise

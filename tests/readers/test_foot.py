@@ -95,7 +95,7 @@ def test_a_walk_over_marked_points(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"timestamps_all": [[0.0, 0.005]]}, "timestamps_all has 2 stamps; expected 3, one an inertial row"),
+        ({"timestamps_all": [[0.0, 0.005]]}, "timestamps_all has 2 stamps; expected 3, one per inertial row"),
         ({"gt": [[0.0, 0.0]]}, r"gt has shape \(1, 2\); expected \(3, 2\)"),
         ({"imu_data": [[1.0, 2.0]]}, r"imu_data has shape \(1, 2\); expected \(n, 6\)"),
         ({"gt": None, "timestamps": [[0.0, 0.1, 0.2]], "strideIndex": [[3]]}, "strideIndex up to 3; expected row"),

@@ -71,7 +71,7 @@ def test_pictures_in_an_archive_are_reported(folder):
     ("file", "text", "parts"),
     [
         ("calib.txt", "1 2 3\n", ("calib.txt: the first row is no matrix", "12 numbers")),
-        ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", ("poses.txt: has 1 rows; expected 2, one a picture",)),
+        ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", ("poses.txt: has 1 rows; expected 2, one per picture",)),
         ("poses.txt", POSES.replace("0 0 1 0.5", "0 0 2 0.5"), ("3x3 part of row 1 is no rotation",)),
         ("times.txt", "0.0\nx\n", ("times.txt: t is 'x' at row 1",)),
         ("image_0/000000.png", "no picture", ("000000.png: is no PNG",)),

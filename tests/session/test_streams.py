@@ -173,7 +173,7 @@ def test_a_position_is_geodetic_or_local_never_both_or_neither():
 
 
 def test_shapes_must_fit_the_stamps():
-    with pytest.raises(SessionError, match=r"imu: gyro has shape \(5, 3\); expected \(6, 3\), one row a time stamp"):
+    with pytest.raises(SessionError, match=r"imu: gyro has shape \(5, 3\); expected \(6, 3\), one row per time stamp"):
         Imu(t_ns=np.arange(6), gyro=np.zeros((5, 3)), accel=np.zeros((6, 3)))
     with pytest.raises(SessionError, match=r"imu: accel has shape \(6,\)"):
         Imu(t_ns=np.arange(6), gyro=np.zeros((6, 3)), accel=np.zeros(6))

@@ -97,7 +97,7 @@ class PoseFixNoise:
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """Ranges that carry no sigma of their own, m: white noise; bias_sigma : m, of the constant error of an anchor,
+    """Ranges without sigma, m: white noise; bias_sigma : m, of the constant error of an anchor,
     zero for none."""
 
     sigma: float = 0.2

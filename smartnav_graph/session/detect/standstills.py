@@ -199,7 +199,7 @@ def _rests(blocks: Blocks, t_ns: Times, noise: ImuNoise, gravity: float, on_foot
 
 
 def _hand_speed(blocks: Blocks) -> Floats:
-    """Sigma (n,) m/s of the hand of a pedestrian who stands; NaN where nobody stands."""
+    """Sigma (n,) m/s of the hand of a pedestrian who stands; NaN elsewhere."""
     if len(blocks.whole) < REST_BLOCKS:
         return np.full(len(blocks.of), np.nan)
     found = _quiet_scatter(blocks, REST_BLOCKS, REST_MARGIN, *STAND_IN_HAND)

@@ -21,13 +21,13 @@ from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session.streams import Imu
 
 RATE_HZ = 50.0
-CUTOFF_HZ = 3.0  # people make 1.4 to 2.5 steps a second
+CUTOFF_HZ = 3.0  # people walk at 1.4 to 2.5 steps per second
 HALF_S = 0.2  # half length of the low-pass filter
-MEAN_S = 2.0  # the mean of so many seconds before is taken off
+MEAN_S = 2.0  # the mean of so many seconds before is subtracted
 RISE = 0.2  # m/s^2 above the mean that ends a step, after as much below it
 LEAST_SWING = 0.75  # m/s^2 from the least to the largest: a slow pedestrian who writes swings by 1
 SHORTEST_S, LONGEST_S = 0.25, 0.75  # of a step: what lies longer before its end is no part of it
-LONGEST_PERIOD_S, RUN, RATIO = 1.0, 6, 0.25  # of a regular walk: seconds a step, steps in a row, change of period
+LONGEST_PERIOD_S, RUN, RATIO = 1.0, 6, 0.25  # of a regular walk: seconds per step, steps in a row, change of period
 LOOKAHEAD_S = HALF_S + 1.0 / RATE_HZ + LONGEST_S
 
 
