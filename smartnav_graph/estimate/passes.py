@@ -50,6 +50,7 @@ def run_pass(
 
     on_update : called after each update with it and the reading of `time.perf_counter` before it
     """
+    builders = [builder.begin() for builder in builders]
     with _no_collection():
         for window in windows:
             begin = time.perf_counter()

@@ -13,7 +13,7 @@ Source: ICAO Doc 7488 (1993), Manual of the ICAO standard atmosphere; below 11 k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -105,6 +105,10 @@ class BarometerBuilder(Builder):
     name: str = "barometer"
     stage: int = 0
     _start: float = 0.0
+
+    def begin(self) -> BarometerBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _start=0.0)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The bias at the keyframe, tied to the one before, and the mean height around the keyframe."""

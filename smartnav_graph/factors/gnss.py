@@ -136,6 +136,10 @@ class PositionBuilder(Builder):
     def __post_init__(self) -> None:
         self.lever = np.broadcast_to(self.lever, self.position.shape)
 
+    def begin(self) -> PositionBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _squares=deque(maxlen=REMEMBERED))
+
     @classmethod
     def of(
         cls, session: Session, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig

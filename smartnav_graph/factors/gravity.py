@@ -17,7 +17,7 @@ Source: Mahony, Hamel, Pflimlin (2008), Nonlinear complementary filters on SO(3)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -122,6 +122,10 @@ class GravityBuilder(Builder):
     stage: int = 0
     _stretch: Stretch = field(default_factory=Stretch)
     _begin_ns: int = 0
+
+    def begin(self) -> GravityBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _stretch=Stretch(), _begin_ns=0)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Take the window into the stretch; a row where the stretch is long enough."""

@@ -228,10 +228,13 @@ class ImuBuilder(Builder):
         lean = self.gravity**2 * before[:3].max() + strayed**2
         return np.asarray(before[3:6] + length_s**2 * before[6:9] + (0.5 * length_s**2) ** 2 * lean + own)
 
+    def begin(self) -> ImuBuilder:
+        """See `Builder.begin`; windows preintegrated before stay at hand."""
+        return replace(self, _straying=gap_error.Straying())
+
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors of one window; nothing at the first keyframe."""
         if previous is None:
-            self._straying.known.clear()
             return
         pass_state = self.turning(window, previous.bias, pass_state)
         pim = self.preintegrate(window, previous.bias, pass_state)

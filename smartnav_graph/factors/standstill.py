@@ -17,7 +17,7 @@ Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, I
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -74,6 +74,10 @@ class StandstillBuilder(Builder):
     name: str = "static"
     stage: int = 0
     _floor: SessionState | None = None
+
+    def begin(self) -> StandstillBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _floor=None)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors at the keyframe that ends `window`."""

@@ -172,6 +172,11 @@ class Builder:
     lookahead_s: float = 0.0
     note: str = ""
 
+    def begin(self) -> Builder:
+        """The builder of one pass. One that accumulates over windows gives a copy that has seen none: what a pass finds
+        out is left to the next in `PassState` alone."""
+        return self
+
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Add this sensor's factors for `window`; `previous` is the latest state (None at the first keyframe)."""
         raise NotImplementedError
@@ -202,7 +207,7 @@ def one_of(builders: Iterable[Builder], kind: type[Kind]) -> Kind | None:
 def build_update(
     window: Window, previous: State | None, builders: Iterable[Builder], pass_state: PassState, t_origin_ns: int
 ) -> GraphUpdate:
-    """The step of one window: every builder in turn."""
+    """The update of one window: every builder in turn."""
     update = GraphUpdate(window.index, window.t1_ns, (window.t1_ns - t_origin_ns) / 1e9)
     for builder in builders:
         if builder.stage <= pass_state.stage:
