@@ -45,19 +45,35 @@ def run_pass(
     builders: Sequence[Builder],
     pass_state: PassState,
     on_update: Callable[[GraphUpdate, float], None] | None = None,
-) -> None:
+    *,
+    interruptible: bool = False,
+) -> PassState:
     """One pass: build the update of every window and give it to the smoother.
 
+    Parameters
+    ----------
     on_update : called after each update with it and the reading of `time.perf_counter` before it
+    interruptible : an interrupt ends the pass instead of being raised
+
+    Returns
+    -------
+    the pass state with what the builders selected in a causal pass
     """
     builders = [builder.begin() for builder in builders]
-    with _no_collection():
-        for window in windows:
-            begin = time.perf_counter()
-            update = build_update(window, smoother.latest(), builders, pass_state, smoother.t0_ns)
-            smoother.update(update)
-            if on_update is not None:
-                on_update(update, begin)
+    try:
+        with _no_collection():
+            for window in windows:
+                begin = time.perf_counter()
+                update = build_update(window, smoother.latest(), builders, pass_state, smoother.t0_ns)
+                smoother.update(update)
+                if on_update is not None:
+                    on_update(update, begin)
+    except KeyboardInterrupt:
+        if not interruptible:
+            raise
+    for builder in builders:
+        pass_state = builder.end(pass_state)
+    return pass_state
 
 
 @contextmanager
@@ -183,7 +199,7 @@ def solve_passes(
             clock.pass_done(estimate, _preintegration_s(problem) - before_s)
         updated, done = update_pass_state(problem.builders, windows, estimate, pass_.pass_state)
         joins = updated.stage > pass_.pass_state.stage
-        diverged = joins and images_diverged(problem.builders, estimate)
+        diverged = joins and images_diverged(problem.builders, estimate, updated)
         following = next_pass(pass_, estimate, updated, done=done, diverged=diverged)
         if following is None:
             return estimate, pass_.pass_state, pass_.number
@@ -205,7 +221,7 @@ def _check_pairs_again(smoother: Batch, builders: Sequence[Builder], pass_state:
     pairs = one_of(builders, CoplanarityBuilder)
     while pairs is not None and 0 < pass_state.tests(pairs.name) < COMPRESSED:
         pass_state = check_pairs(builders, smoother.provisional(), pass_state)
-        smoother.renewed(partial(pairs.renew, pass_state=pass_state))
+        smoother.renewed(partial(pairs.begin().renew, pass_state=pass_state))
     return pass_state
 
 
@@ -215,10 +231,10 @@ def causal_start(
     """Initial values found window by window, as in replay, and the pass state after that: where dead reckoning drifts
     too far, standstills and images bound its errors on the way."""
     smoother = incremental(ReplayConfig(), problem.session.t0_ns)
-    causal = replace(pass_state, phase=Phase.CAUSAL, outlier_tests={})
+    causal = replace(pass_state, phase=Phase.CAUSAL, outlier_tests={}, selections={})
     builders = [prior.with_position(), *problem.builders]
     run_pass(smoother, watched("window by window", windows, progress), builders, causal)
-    pass_state = replace(pass_state, outlier_tests={})
+    pass_state = replace(pass_state, outlier_tests={}, selections={})
     if pass_state.stage < LAST_STAGE:
         return smoother.values(), pass_state
     estimate = smoother.estimate()

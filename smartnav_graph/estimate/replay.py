@@ -47,18 +47,17 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     clock.lap("initialise")
     smoother = incremental(problem.config.replay, problem.session.t0_ns)
     builders, log = [initial.prior.with_position(), *problem.builders], UpdateLog(smoother)
-    interrupted = False
-    try:
-        run_pass(smoother, watched("replay", problem.windows, progress), builders, _causal(problem, initial), log.take)
-    except KeyboardInterrupt:
-        interrupted = True
-        if len(log.states) < 2:
-            raise
+    windows, pass_state = watched("replay", problem.windows, progress), _causal(problem, initial)
+    pass_state = run_pass(smoother, windows, builders, pass_state, log.take, interruptible=True)
     clock.lap("replay")
-    count, last_ns = len(log.states), log.states[-1].t_ns if interrupted else None
+    count = len(log.states)
+    interrupted = count < len(problem.windows)
+    if interrupted and count < 2:
+        raise KeyboardInterrupt
+    last_ns = log.states[-1].t_ns if interrupted else None
     problem = _counted(replace(problem, windows=problem.windows[:count]), smoother.dropped)
-    estimate, pass_state = smoother.estimate(count), _causal(problem, initial)
-    causal, windows, updates = causal_solution(problem, log.states), problem.windows, log.updates()
+    estimate, causal, updates = smoother.estimate(count), causal_solution(problem, log.states), log.updates()
+    causal_windows = problem.windows
     extra: dict[str, Any] = {
         "mode": f"replay {problem.config.replay.smoother}" + (", interrupted" if interrupted else ""),
         "update_ms": {name: float(f(log.latency_ms)) for name, f in _LATENCY.items()},
@@ -71,7 +70,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
             extra["mode"] += ", polish interrupted"
         clock.lap("polish")
     run = _finish(SolvedProblem(problem, estimate, pass_state), initial, clock, extra, causal, updates)
-    return replace(run, causal_windows=windows)
+    return replace(run, causal_windows=causal_windows)
 
 
 def _causal(problem: Problem, initial: InitialState) -> PassState:

@@ -37,7 +37,8 @@ from smartnav_graph.smoothers.estimate import Estimate
 @dataclass(frozen=True)
 class Run:
     """Everything one run gives. `summary` is what summary.json holds; `causal_windows` are those that a replay went
-    through, one a row of `causal`; `estimate` is the solved graph behind `solution`."""
+    through, one a row of `causal`; `estimate` is the solved graph behind `solution`, made with
+    `pass_state`."""
 
     problem: Problem
     solution: Solution
@@ -47,6 +48,7 @@ class Run:
     causal_windows: Sequence[Window] = ()
     trace: Diagnostics | None = None
     estimate: Estimate | None = None
+    pass_state: PassState = field(default_factory=PassState)
 
     @property
     def session(self) -> Session:
@@ -113,7 +115,9 @@ def _finish(
     clock.lap("assemble")
     summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)
     trace = Diagnostics.of(problem, estimate, solved.pass_state, updates)
-    return Run(problem, solution, summary, causal, withheld, trace=trace, estimate=estimate)
+    return Run(
+        problem, solution, summary, causal, withheld, trace=trace, estimate=estimate, pass_state=solved.pass_state
+    )
 
 
 def _refuse_empty(problem: Problem, pass_state: PassState) -> None:

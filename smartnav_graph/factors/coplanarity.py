@@ -22,7 +22,7 @@ from smartnav_graph.core.so3 import exp, rotate
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.camera import BodyRates, CameraModel, Motion, make_camera_model, seen_from
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, Matched, PairRows, Relative, Rig
+from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, PairRows, Relative, Rig
 from smartnav_graph.graph.keyframes import KeyframeConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
@@ -83,15 +83,31 @@ REASONS = (
 IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
 
 
+@dataclass(frozen=True)
+class PairSelection:
+    """Which image pairs and matches are used, and the motion they were selected with.
+
+    pairs : as they were in the first row of each image, by the motion found; use (n, k) : matches, padded
+    rate (k, 3) rad/s : of the body from the images' keyframe stamps to the clock offset found; motion : of it
+    verdict (n,) : what became of each pair, places in `REASONS`; refused : why none is used, in words
+    poses : relative poses of the pairs where their matches were selected
+    """
+
+    pairs: Pairs
+    use: Mask
+    rate: Floats
+    motion: Motion
+    verdict: NDArray[np.intp]
+    refused: str = ""
+    poses: Relative | None = None
+
+
 @dataclass
 class CoplanarityBuilder(Builder):
     """Adds the pairs that end at a keyframe.
 
-    seen : pairs as they were matched; pairs : as they were in the first row of each image, by the motion found
-    image_ns (k,) : keyframe stamps of the images, by the clock offset that is known; rate (k, 3) rad/s : of the body
-    from there to the offset found; motion : of the body at the images; eye : the camera; sigma : of a match, normalised
-    verdict (n,) : what became of each pair, places in `REASONS`; at_once (n,) : the same as a replay judged
-    refused : why none is used, in words; frozen : relative poses of the pairs where their inliers were settled
+    seen : pairs as they were matched; image_ns (k,) : keyframe stamps of the images, by the clock offset that is known
+    sigma : of a match, normalised
     """
 
     seen: Pairs
@@ -104,22 +120,24 @@ class CoplanarityBuilder(Builder):
     note: str = ""
     name: str = "image_pairs"
     stage: int = 1
-    pairs: Pairs = field(init=False)
-    verdict: NDArray[np.intp] = field(init=False)
-    at_once: NDArray[np.intp] = field(init=False)
-    rate: Floats = field(init=False)
-    motion: Motion = field(init=False)
-    refused: str = ""
-    frozen: Relative | None = None
+    _causal: PairSelection | None = None
     _keyframe: dict[int, int] = field(default_factory=dict)
     _turn: dict[int, Floats] = field(default_factory=dict)
     _now: Floats = field(default_factory=lambda: np.eye(3))
     _made: tuple[tuple[object, ...], RowModel] | None = None
 
-    def __post_init__(self) -> None:
-        self.pairs = self.seen
-        self.verdict, self.at_once = (np.full(len(self.pairs), OUTSIDE, dtype=np.intp) for _ in range(2))
-        self.rate, self.motion = np.zeros((len(self.image_ns), 3)), Motion.unknown(len(self.image_ns))
+    def _none_selected(self) -> PairSelection:
+        """Before anything was tested."""
+        rate, motion = np.zeros((len(self.image_ns), 3)), Motion.unknown(len(self.image_ns))
+        verdict = np.full(len(self.seen), OUTSIDE, dtype=np.intp)
+        return PairSelection(self.seen, self.seen.there.copy(), rate, motion, verdict)
+
+    def selection(self, pass_state: PassState) -> PairSelection:
+        """The selection in a pass: that of the pass before, in replay the one under way."""
+        if self._causal is not None and pass_state.causal:
+            return self._causal
+        found = pass_state.selections.get(self.name)
+        return found if isinstance(found, PairSelection) else self._none_selected()
 
     @property
     def rig(self) -> Rig:
@@ -130,39 +148,39 @@ class CoplanarityBuilder(Builder):
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The pairs whose second image stands at the window's end."""
-        if previous is None:
-            self._begin()
-        elif pass_state.causal:
-            self._go_on(window, previous)
+        if pass_state.causal:
+            self._causal = self._causal or replace(self._none_selected(), use=np.zeros_like(self.seen.there))
+            if previous is not None:
+                self._go_on(window, previous)
         image = self._image_at(window.t1_ns)
         if image is None:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
         ending = self._ending(image)
-        if pass_state.causal:
-            self._look_now(image, update)
-            self._judge_now(self._model(pass_state), ending)
+        if self._causal is not None and pass_state.causal:
+            self._look_now(self._causal.rate, self._causal.motion, image, update)
+            self._select_now(self._causal, self._model(pass_state), ending)
         self._add_pairs(update, ending, pass_state)
 
     def renew(self, update: GraphUpdate, pass_state: PassState) -> None:
-        """The pairs of a step once more, as what was learnt since has them."""
+        """The pairs of an update once more, as selected since; of all updates of a pass, in order."""
         image = self._image_at(update.t_ns)
         if image is not None:
+            self._keyframe[image] = update.index
             update.blocks = [block for block in update.blocks if block.sensor != self.name]
             self._add_pairs(update, self._ending(image), pass_state)
             update.hold(pass_state.fixed_states)
 
     def _ending(self, image: int) -> NDArray[np.intp]:
         """Pairs whose second image this is, and whose first one has a keyframe."""
-        first, last = np.searchsorted(self.pairs.images[:, 1], [image, image + 1])
-        return np.array(
-            [k for k in range(first, last) if int(self.pairs.images[k, 0]) in self._keyframe], dtype=np.intp
-        )
+        first, last = np.searchsorted(self.seen.images[:, 1], [image, image + 1])
+        return np.array([k for k in range(first, last) if int(self.seen.images[k, 0]) in self._keyframe], dtype=np.intp)
 
     def _add_pairs(self, update: GraphUpdate, ending: NDArray[np.intp], pass_state: PassState) -> None:
         if self.replaced(pass_state):
             return
-        verdict = self.verdict_of(pass_state)
+        selection = self.selection(pass_state)
+        verdict = selection.verdict
         ending = ending[(verdict[ending] == IN_USE) | (verdict[ending] == CONTRARY)]
         if not len(ending):
             return
@@ -170,12 +188,12 @@ class CoplanarityBuilder(Builder):
         states = self.camera_model.states()
         keys, data = [], np.empty((len(ending), COLUMNS))
         for row, pair in enumerate(ending):
-            images = [int(i) for i in self.pairs.images[pair]]
+            images = [int(i) for i in self.seen.images[pair]]
             own = iter([key("X", self._keyframe[i]) for i in images])
             speed = iter([key("V", self._keyframe[i]) for i in images])
             of = {"X": own, "V": speed}
             keys.append(tuple(next(of[a]) if a in of else update.use(states[a]) for a in self.rig.letters))
-            data[row] = [pair, *self.rate[images].ravel()]
+            data[row] = [pair, *selection.rate[images].ravel()]
         update.blocks.append(
             FactorBatch(self.name, model, keys, data, update.t_ns, rows=tuple(ending.tolist()), used=used)
         )
@@ -184,13 +202,15 @@ class CoplanarityBuilder(Builder):
         """Whether tracks stand in for the pairs in a pass with this memory."""
         return pass_state.tests(SMART) > 0 and not pass_state.causal
 
-    def verdict_of(self, pass_state: PassState) -> NDArray[np.intp]:
-        """What became of each pair (n,) in a pass with this memory."""
-        return self.verdict if pass_state.tests(self.name) else self.at_once
+    def begin(self) -> CoplanarityBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _causal=None, _keyframe={}, _turn={}, _now=np.eye(3), _made=None)
 
-    def _begin(self) -> None:
-        """Forget the pass before."""
-        self._keyframe, self._turn, self._now = {}, {}, np.eye(3)
+    def end(self, pass_state: PassState) -> PassState:
+        """See `Builder.end`."""
+        if self._causal is None:
+            return pass_state
+        return replace(pass_state, selections={**pass_state.selections, self.name: self._causal})
 
     def _go_on(self, window: Window, previous: State) -> None:
         """Carry the attitude since the start over one window."""
@@ -204,46 +224,33 @@ class CoplanarityBuilder(Builder):
         return near if found else None
 
     def _model(self, pass_state: PassState) -> RowModel:
-        """The row model of a pass: made anew where what was learnt changed."""
-        learnt = (
-            pass_state.rejected.get("matches"),
-            pass_state.tests(self.name),
-            pass_state.scale(self.name),
-            pass_state.phase,
-        )
-        if self._made is None or self._made[0] != learnt:
-            self._made = (learnt, self._new_model(pass_state))
+        """The row model of a pass: made again where the selection or the noise changed."""
+        by = (self.selection(pass_state), pass_state.tests(self.name), pass_state.scale(self.name))
+        if self._made is None or self._made[0][0] is not by[0] or self._made[0][1:] != by[1:]:
+            self._made = (by, self._new_model(pass_state))
         return self._made[1]
 
     def _new_model(self, pass_state: PassState) -> RowModel:
-        sigma = self.sigma * pass_state.scale(self.name)
-        if pass_state.causal:
-            return PairRows(self.pairs, self.rig, sigma, np.zeros_like(self.pairs.there), LOSS_SCALE)
-        use, settled = self._padded_use(pass_state), pass_state.tests(self.name)
-        if settled == COMPRESSED and self.frozen is not None:
-            return CompressedRows(self.pairs, self.rig, sigma, use, LOSS_SCALE, self.frozen)
-        return PairRows(self.pairs, self.rig, sigma, use, LOSS_SCALE)
-
-    def _padded_use(self, pass_state: PassState) -> Mask:
-        use = pass_state.used("matches", np.arange(len(self.pairs.pair)))
-        return np.asarray(self.pairs.padded(use), dtype=bool)
+        sigma, selection = self.sigma * pass_state.scale(self.name), self.selection(pass_state)
+        if pass_state.tests(self.name) == COMPRESSED and selection.poses is not None:
+            return CompressedRows(selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE, selection.poses)
+        return PairRows(selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE)
 
     # --- when rows were seen ---
 
-    def look(self, offset_s: float, motion: Motion) -> None:
-        """Take the motion found at the images, and the clock offset of the camera."""
-        self.rate[:] = self.rates.mean(self.image_ns, offset_s) - motion.gyro_bias
-        self.motion = motion
-        self.pairs = self._at_once(self.seen, offset_s)
+    def with_motion(self, before: PairSelection, offset_s: float, motion: Motion) -> PairSelection:
+        """A selection with the motion found at the images, and the clock offset of the camera."""
+        rate = self.rates.mean(self.image_ns, offset_s) - motion.gyro_bias
+        return replace(before, rate=rate, motion=motion, pairs=self._at_once(self.seen, offset_s, rate, motion))
 
-    def _look_now(self, image: int, update: GraphUpdate) -> None:
-        """The same at one image of a replay, by what is foretold there."""
-        motion, bias = self.motion, update.bias.gyroscope()
-        self.rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
+    def _look_now(self, rate: Floats, motion: Motion, image: int, update: GraphUpdate) -> None:
+        """Rate and motion at one image of a replay, by prediction."""
+        bias = update.bias.gyroscope()
+        rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
         motion.nav_R_body[image] = update.predicted.attitude().matrix()
         motion.nav_v_body[image], motion.gyro_bias[image] = update.predicted.velocity(), bias
 
-    def _at_once(self, pairs: Pairs, offset_s: float) -> Pairs:
+    def _at_once(self, pairs: Pairs, offset_s: float, rate: Floats, motion: Motion) -> Pairs:
         """Pairs as they would be had all rows of an image been read at once with its first.
 
         A ray seen d later turns with the camera, x' ~ Exp(w d) x~, and its camera has gone on by v d: pairs whose rows
@@ -251,8 +258,7 @@ class CoplanarityBuilder(Builder):
         """
         if self.camera_model.readout_s == 0:
             return pairs
-        stamps, motion = self.image_ns + round(offset_s * NS), self.motion
-        speed = self.camera_model.velocity(motion, self.rate)
+        stamps, speed = self.image_ns + round(offset_s * NS), self.camera_model.velocity(motion, rate)
         xy, way = [], []
         for x, place in zip((pairs.x0, pairs.x1), pairs.images[pairs.pair].T, strict=True):
             delay = self.camera_model.delay(x)
@@ -264,22 +270,20 @@ class CoplanarityBuilder(Builder):
     # --- which matches ---
 
     def used_matches(self, pass_state: PassState) -> Mask:
-        """Mask (m,) of the matches in use in a pass with this memory."""
-        model = self._model(pass_state)
-        assert isinstance(model, Matched)
-        return np.asarray(self.pairs.flat(model.use), dtype=bool)
+        """Mask (m,) of the matches in use in a pass."""
+        return np.asarray(self.seen.flat(self.selection(pass_state).use), dtype=bool)
 
-    def _judge_now(self, model: RowModel, ending: NDArray[np.intp]) -> None:
-        """Judge new pairs by the turn since their first image."""
+    def _select_now(self, selection: PairSelection, model: RowModel, ending: NDArray[np.intp]) -> None:
+        """Select matches of new pairs by the rotation since their first image."""
         assert isinstance(model, PairRows)
         if not len(ending):
             return
         C = self.rig.body_R_cam
-        turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.pairs.images[ending]]
-        some = self._at_once(self.seen.of(ending), 0.0)
+        turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.seen.images[ending]]
+        some = self._at_once(self.seen.of(ending), 0.0, selection.rate, selection.motion)
         if some.shift is not None:
             model.see(ending, some)
-        use, self.at_once[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
+        use, selection.verdict[ending] = self.by_turn(some, C.T @ np.array(turns) @ C)
         model.use[ending, : use.shape[1]] = use
 
     def by_turn(self, pairs: Pairs, R: Floats) -> tuple[Mask, NDArray[np.intp]]:

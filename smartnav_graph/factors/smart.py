@@ -18,8 +18,7 @@ ICRA (SmartProjectionPoseFactor of GTSAM).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -76,13 +75,26 @@ REASONS = (
 IN_USE, OUTSIDE, FEW, FLAT, CONTRARY = range(len(REASONS))
 
 
+@dataclass(frozen=True)
+class TrackSelection:
+    """Which tracks and observations are used.
+
+    use (n, l) : observations; xy (n, l, 2) : what they are as seen at their keyframe; boresight (3,) rad, as held
+    verdict (n,) : what became of each track, places in `REASONS`; refused : why none is used, in words
+    """
+
+    use: Mask
+    xy: Floats
+    boresight: Floats
+    verdict: NDArray[np.intp]
+    refused: str = ""
+
+
 @dataclass
 class SmartBuilder(Builder):
     """Adds a track at the keyframe that saw it last.
 
     image_ns (k,) : keyframe stamps of the images; sigma : of an observation, normalised
-    use (n, l) : observations in use; xy (n, l, 2) : what they are as seen at their keyframe; boresight (3,) rad
-    verdict (n,) : what became of each track, places in `REASONS`; refused : why none is used, in words
     """
 
     sightings: TrackObservations
@@ -94,21 +106,22 @@ class SmartBuilder(Builder):
     config: SmartConfig = field(default_factory=SmartConfig)
     name: str = SMART
     stage: int = 1
-    refused: str = ""
-    use: Mask = field(init=False)
-    xy: Floats = field(init=False)
-    boresight: Floats = field(default_factory=lambda: np.zeros(3))
-    verdict: NDArray[np.intp] = field(init=False)
     _keyframe: dict[int, int] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self.use, self.xy = self.sightings.there.copy(), self.sightings.xy.copy()
-        self.verdict = np.full(len(self.sightings), OUTSIDE, dtype=np.intp)
+    def begin(self) -> SmartBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _keyframe={})
+
+    def selection(self, pass_state: PassState) -> TrackSelection:
+        """The selection in a pass."""
+        found = pass_state.selections.get(self.name)
+        if isinstance(found, TrackSelection):
+            return found
+        none = np.full(len(self.sightings), OUTSIDE, dtype=np.intp)
+        return TrackSelection(self.sightings.there, self.sightings.xy, np.zeros(3), none)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The tracks that end at the window's end."""
-        if previous is None:
-            self._keyframe = {}
         near = int(np.searchsorted(self.image_ns, window.t1_ns - self.merge_ns))
         if near == len(self.image_ns) or self.image_ns[near] > window.t1_ns + self.merge_ns:
             return
@@ -117,33 +130,30 @@ class SmartBuilder(Builder):
             return
         for state in self.camera_model.states().values():
             update.use(state)
-        first, last = np.searchsorted(self.sightings.last, [near, near + 1])
+        selection, (first, last) = self.selection(pass_state), np.searchsorted(self.sightings.last, [near, near + 1])
         for row in range(first, last):
-            if self.verdict[row] == IN_USE:
-                update.add(FactorId(self.name, update.t_ns, row), self._factor(row, pass_state))
+            if selection.verdict[row] == IN_USE:
+                update.add(FactorId(self.name, update.t_ns, row), self._factor(row, selection, pass_state))
 
     def in_force(self, pass_state: PassState) -> bool:
-        """Whether tracks stand in for image pairs in a pass with this memory."""
+        """Whether tracks stand in for image pairs in a pass."""
         return pass_state.tests(self.name) > 0 and not pass_state.causal
 
-    def _factor(self, row: int, pass_state: PassState) -> Any:
+    def _factor(self, row: int, selection: TrackSelection, pass_state: PassState) -> gtsam.NonlinearFactor:
         noise = gtsam.noiseModel.Isotropic.Sigma(2, FOCAL * self.sigma * pass_state.scale(self.name))
-        factor = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _IDEAL, self._mount, _PARAMS)
-        for place in np.flatnonzero(self.use[row]):
-            factor.add(FOCAL * self.xy[row, place], key("X", self._keyframe[int(self.sightings.image[row, place])]))
+        body_T_cam = gtsam.Pose3(gtsam.Rot3(self.body_R_cam(selection)), self.camera_model.rig.body_t_cam)
+        factor = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _IDEAL, body_T_cam, _PARAMS)
+        for place in np.flatnonzero(selection.use[row]):
+            keyframe = self._keyframe[int(self.sightings.image[row, place])]
+            factor.add(FOCAL * selection.xy[row, place], key("X", keyframe))
         return factor
 
-    @property
-    def body_R_cam(self) -> Floats:
+    def body_R_cam(self, selection: TrackSelection) -> Floats:
         """With the boresight found."""
-        return np.asarray(self.camera_model.rig.body_R_cam @ exp(self.boresight[None])[0])
-
-    @property
-    def _mount(self) -> Any:
-        return gtsam.Pose3(gtsam.Rot3(self.body_R_cam), self.camera_model.rig.body_t_cam)
+        return np.asarray(self.camera_model.rig.body_R_cam @ exp(selection.boresight[None])[0])
 
 
-def _params() -> Any:
+def _params() -> gtsam.SmartProjectionParams:
     """Rows by projection onto the null space, which QR takes as they are; a point that a candidate sends behind a
     camera counts as one at infinity, which costs, instead of nothing, which would pay."""
     modes = gtsam.LinearizationMode.JACOBIAN_SVD, gtsam.DegeneracyMode.HANDLE_INFINITY

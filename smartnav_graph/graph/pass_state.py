@@ -43,6 +43,7 @@ class PassState:
     aligned_states : value (d,) and sigma of session states that the alignment found, by name
     stage : a builder takes part from its own `stage` on
     phase : treatment of outliers
+    selections : what a builder of images selected of its measurements, by its name
     outlier_tests : how often image pairs and tracks were tested against a solution, by builder
     weights, gnc_mu : weights of rows between 0 and 1 by sensor, and the control parameter mu of GNC
     robust_floor_m : least sigma (m) of a fix under the redescending loss
@@ -55,6 +56,7 @@ class PassState:
     aligned_states: Mapping[str, tuple[Floats, float]] = field(default_factory=dict)
     stage: int = 0
     phase: Phase = Phase.PLAIN
+    selections: Mapping[str, object] = field(default_factory=dict)
     outlier_tests: Mapping[str, int] = field(default_factory=dict)
     weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     gnc_mu: float = 0.0

@@ -181,6 +181,10 @@ class Builder:
         """Add this sensor's factors for `window`; `previous` is the latest state (None at the first keyframe)."""
         raise NotImplementedError
 
+    def end(self, pass_state: PassState) -> PassState:
+        """The state of a causal pass with what this builder, as `begin` gave it, selected in it."""
+        return pass_state
+
     def has_second_stage(self, pass_state: PassState) -> bool:
         """Whether it adds more, or has noise to estimate, once the trajectory is found."""
         return self.stage == LAST_STAGE

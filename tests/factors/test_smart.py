@@ -11,7 +11,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.estimate import config
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.factors.coplanar_rows import Rig
-from smartnav_graph.factors.smart import FOCAL, IN_USE, SmartConfig
+from smartnav_graph.factors.smart import FOCAL, IN_USE, OUTSIDE, SmartConfig
 from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import GraphUpdate
@@ -35,13 +35,20 @@ def problem():
 
 def smart(problem):
     builder = next(b for b in problem.builders if b.name == "smart")
-    builder.verdict[:], builder.sigma = IN_USE, SIGMA
-    return builder
+    return replace(builder, sigma=SIGMA)
 
 
-def steps(problem, builder, pass_state=IN_FORCE):
-    """What the builder adds to the step of every window."""
-    found, previous = [], None
+def selected(builder, **changes):
+    """All tracks in use."""
+    selection = builder.selection(IN_FORCE)
+    selection = replace(selection, verdict=np.full_like(selection.verdict, IN_USE))
+    return replace(IN_FORCE, selections={"smart": replace(selection, **changes)})
+
+
+def steps(problem, builder, pass_state=None):
+    """What the builder adds to the update of every window."""
+    found, previous, builder = [], None, builder.begin()
+    pass_state = selected(builder) if pass_state is None else pass_state
     for window in problem.windows:
         update = GraphUpdate(window.index, window.t1_ns, 0.0)
         builder.add(update, window, previous, pass_state)
@@ -123,10 +130,9 @@ def test_a_point_is_searched_to_the_end(problem):
     """GTSAM's search for a point ends at an absolute change of the squares: in small units it would not begin."""
     builder, values = smart(problem), truth(problem)
     rng = np.random.default_rng(0)
-    clean = builder.xy.copy()
-    builder.xy = clean + rng.normal(0, SIGMA, clean.shape)
-    noisy = [factor for step in steps(problem, builder) for _, factor in step.factors]
-    builder.xy = clean
+    clean = builder.sightings.xy
+    noise = selected(builder, xy=clean + rng.normal(0, SIGMA, clean.shape))
+    noisy = [factor for step in steps(problem, builder, noise) for _, factor in step.factors]
     noisy = [factor for factor in noisy if way(factor, values) > 0.3]  # m: the rest has no point
     rows = sum(2 * factor.size() - 3 for factor in noisy)
     assert 2 * sum(factor.error(values) for factor in noisy) / rows == pytest.approx(1.0, abs=0.05)
@@ -137,11 +143,12 @@ def test_tracks_join_once_they_are_judged(problem):
     builder = smart(problem)
     for pass_state in (PassState(stage=1), replace(IN_FORCE, phase=Phase.CAUSAL)):
         assert not any(step.factors for step in steps(problem, builder, pass_state))
-    builder.verdict[::2] = 0 * builder.verdict[::2] + 1
-    some = steps(problem, builder)
-    assert sum(len(step.factors) for step in some) == (builder.verdict == IN_USE).sum()
+    verdict = selected(builder).selections["smart"].verdict.copy()
+    verdict[::2] = OUTSIDE
+    some = steps(problem, builder, selected(builder, verdict=verdict))
+    assert sum(len(step.factors) for step in some) == (verdict == IN_USE).sum()
     coplanarity = next(b for b in problem.builders if b.name == "image_pairs")
-    assert not any(step.blocks for step in steps(problem, coplanarity))
+    assert not any(step.blocks for step in steps(problem, coplanarity, IN_FORCE))
 
 
 def test_every_factor_stands_at_the_keyframe_that_saw_its_track_last(problem):

@@ -60,7 +60,7 @@ def test_the_account_of_pairs_and_matches_is_complete(room, seen):
     summary = seen.summary
     pairs = summary["image_pairs"]
     builder = next(b for b in seen.problem.builders if b.name == "image_pairs")
-    assert sum(pairs.values()) == len(builder.pairs)
+    assert sum(pairs.values()) == len(builder.seen)
     assert summary["factors"]["image_pairs"] == pairs[REASONS[IN_USE]] + pairs[REASONS[CONTRARY]]
     assert summary["chi2_per_dof"]["image_pairs"] == pytest.approx(1.0, abs=0.3)
     assert pairs[REASONS[IN_USE]] > 200
@@ -85,7 +85,7 @@ def test_a_replay_holds_on_to_images_too(room, smoother):
 def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     """All tracks of one image are off by 17 px: the pairs with it contradict the way, whatever pose they would fit."""
     tracks = room.tracks
-    images = next(b for b in seen.problem.builders if b.name == "image_pairs").pairs.t_ns
+    images = next(b for b in seen.problem.builders if b.name == "image_pairs").seen.t_ns
     one = images[len(images) // 2]
     bad = tracks.t_ns == one
     slipped = replace(tracks, xy_n=tracks.xy_n + np.where(bad[:, None], [17 / 575, 0.0], 0.0), xy_px=None)
@@ -94,8 +94,8 @@ def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     clean = errors(seen.solution, room.reference)
     assert metres < clean[0] + 0.02 and degrees < clean[1] + 0.1
     builder = next(b for b in run.problem.builders if b.name == "image_pairs")
-    touched = (builder.pairs.t_ns[builder.pairs.images] == one).any(axis=1)
-    assert touched.sum() == 8 and not (builder.verdict[touched] == IN_USE).any()
+    touched = (builder.seen.t_ns[builder.seen.images] == one).any(axis=1)
+    assert touched.sum() == 8 and not (run.trace.pairs.verdict[touched] == IN_USE).any()
 
 
 def test_images_of_something_else_are_refused(room):

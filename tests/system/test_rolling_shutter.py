@@ -12,6 +12,7 @@ from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.replay import replay
 from smartnav_graph.estimate.run import smooth
 from smartnav_graph.factors.camera import Motion
+from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.simulation.scenarios import SCENARIOS
 from smartnav_graph.vision.epipolar import sampson
 
@@ -36,8 +37,8 @@ def misses(session, row_time):
     truth = session.reference
     at = np.searchsorted(truth.t_ns, builder.image_ns)
     R = Rotation.from_quat(truth.quat[at], scalar_first=True).as_matrix()
-    builder.look(0.0, Motion(R, truth.velocity[at], truth.gyro_bias[at]))
-    pairs, rig = builder.pairs, builder.rig
+    motion = Motion(R, truth.velocity[at], truth.gyro_bias[at])
+    pairs, rig = builder.with_motion(builder.selection(PassState()), 0.0, motion).pairs, builder.rig
     R, place = R @ rig.body_R_cam, truth.enu[at] + R @ rig.body_t_cam
     i, j = pairs.images[pairs.pair].T
     turn, way = R[i].transpose(0, 2, 1) @ R[j], (R[i].transpose(0, 2, 1) @ (place[j] - place[i])[..., None])[..., 0]

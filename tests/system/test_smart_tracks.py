@@ -11,7 +11,7 @@ from smartnav_graph.estimate import config
 from smartnav_graph.estimate.passes import solve_passes
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.replay import replay
-from smartnav_graph.estimate.reweight.track_outliers import chosen
+from smartnav_graph.estimate.reweight.track_outliers import check_tracks
 from smartnav_graph.estimate.run import initialise, smooth
 from smartnav_graph.factors.smart import IN_USE, REASONS
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, key
@@ -58,7 +58,8 @@ def test_the_account_is_complete(run):
     assert 0.7 < summary["chi2_per_dof"]["overall"] < 1.3
     residuals = run.solution.residuals
     inside = residuals.of("smart")
-    count = builder.use[builder.verdict == IN_USE].sum()
+    selection = builder.selection(run.pass_state)
+    count = selection.use[selection.verdict == IN_USE].sum()
     assert (inside & residuals.used).sum() == 2 * count
     assert summary["rejected"]["tracks"] == (inside & ~residuals.used).sum() // 2
 
@@ -125,7 +126,8 @@ def test_images_that_share_a_keyframe_count_once(room):
     found = smooth(doubled, options(image_pairs={"rate_hz": 1e6, "spans": [2, 8]}, run={"end_s": 9.0}))
     assert found.summary["factors"]["smart"] > 50
     builder = next(b for b in found.problem.builders if b.name == "smart")
-    used = builder.use & (builder.verdict == IN_USE)[:, None]
+    selection = builder.selection(found.pass_state)
+    used = selection.use & (selection.verdict == IN_USE)[:, None]
     assert (builder.sightings.image[used] % 2 == 0).all()
 
 
@@ -149,11 +151,11 @@ def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, builder.sightings.xy.shape)
     builder.sightings = replace(builder.sightings, xy=xy)
     first = replace(pass_state, outlier_tests={**pass_state.outlier_tests, "smart": 1})
-    again = chosen([builder, pairs], estimate, first)
+    again = check_tracks([builder, pairs], estimate, first)
     assert not pairs.replaced(again) and not builder.in_force(again)
-    assert "images_time_offset_s" not in again.held and "camera_boresight_rad" not in again.held
-    assert "too poor to judge them by" in builder.refused
-    assert chosen([builder, pairs], estimate, again) is again
+    assert "images_time_offset_s" not in again.fixed_states and "camera_boresight_rad" not in again.fixed_states
+    assert "too poor to judge them by" in builder.selection(again).refused
+    assert check_tracks([builder, pairs], estimate, again) is again
 
 
 def test_marginals_are_those_of_the_whole_system(solved):

@@ -67,7 +67,7 @@ class ImagePairs:
         builder = one_of(problem.builders, CoplanarityBuilder)
         if builder is None:
             return None
-        use, verdict = builder.used_matches(pass_state), builder.verdict_of(pass_state)
+        use, verdict = builder.used_matches(pass_state), builder.selection(pass_state).verdict
         return cls(builder.seen, use, verdict)
 
 

@@ -24,12 +24,14 @@ from smartnav_graph.factors.coplanarity import (
     POSE_DOF,
     REASONS,
     CoplanarityBuilder,
+    PairSelection,
 )
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.gating import Geometry
+from smartnav_graph.vision.pairs import Pairs
 
 # A match within so many sigmas of the smoothed states is one.
 GATE = 4.0
@@ -46,55 +48,59 @@ def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: Pas
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or pass_state.tests(builder.name) >= COMPRESSED:
         return pass_state
-    return _judged(builder, estimate, pass_state)
+    return _tested(builder, estimate, pass_state)
 
 
-def _judged(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
-    passed, scale = pass_state.tests(builder.name), pass_state.scale(builder.name)
+def _tested(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
+    tests, scale = pass_state.tests(builder.name), pass_state.scale(builder.name)
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, _, v, bias = (x[place] for x in estimate.states())
-    builder.look(estimate.offset_s(STREAM), Motion(R, v, bias[:, 3:]))
-    there, inside = relative_poses(builder, estimate)
-    if passed == 0:
-        use, verdict = builder.by_turn(builder.pairs, there.R)
+    motion = Motion(R, v, bias[:, 3:])
+    selection = builder.with_motion(builder.selection(pass_state), estimate.offset_s(STREAM), motion)
+    poses, inside = relative_poses(builder, selection, estimate)
+    if tests == 0:
+        use, verdict = builder.by_turn(selection.pairs, poses.R)
     else:
-        use, verdict, scale = _by_states(builder, there, scale)
+        use, verdict, scale = _by_states(builder, selection.pairs, poses, scale)
     verdict = np.where(inside, verdict, OUTSIDE)
-    builder.refused = _refusal(verdict)
-    builder.verdict = np.where(verdict == IN_USE, CONTRARY, verdict) if builder.refused else verdict
-    builder.frozen = there
-    used = np.asarray(builder.pairs.flat(use & (builder.verdict == IN_USE)[:, None]))
+    refused = _refusal(verdict)
+    verdict = np.where(verdict == IN_USE, CONTRARY, verdict) if refused else verdict
+    use = use & (verdict == IN_USE)[:, None]
+    selection = replace(selection, use=use, verdict=verdict, refused=refused, poses=poses)
     rejected = {
-        "matches": frozenset(np.flatnonzero(~used).tolist()),
-        builder.name: frozenset(np.flatnonzero(builder.verdict != IN_USE).tolist()),
+        "matches": frozenset(np.flatnonzero(~np.asarray(selection.pairs.flat(use))).tolist()),
+        builder.name: frozenset(np.flatnonzero(verdict != IN_USE).tolist()),
     }
     return replace(
         pass_state,
         rejected={**pass_state.rejected, **rejected},
         noise_scales={**pass_state.noise_scales, builder.name: scale},
-        outlier_tests={**pass_state.outlier_tests, builder.name: COMPRESSED if builder.refused else passed + 1},
+        selections={**pass_state.selections, builder.name: selection},
+        outlier_tests={**pass_state.outlier_tests, builder.name: COMPRESSED if refused else tests + 1},
     )
 
 
-def images_diverged(builders: Iterable[Builder], estimate: Estimate) -> bool:
+def images_diverged(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> bool:
     """Whether the motion between images is too uncertain for image pairs: a redescending loss does not converge from
     so far, and a baseline fits as well with the opposite sign."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None:
         return False
-    there, inside = relative_poses(builder, estimate)
+    selection = builder.selection(pass_state)
+    poses, inside = relative_poses(builder, selection, estimate)
     sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
-    strays = sigma[place][builder.pairs.images[:, 1]] * builder.pairs.length_s
-    diverged = strays > LARGEST_STRAY * np.linalg.norm(there.t, axis=1)
-    used = inside & (builder.verdict == IN_USE)
+    strays = sigma[place][builder.seen.images[:, 1]] * builder.seen.length_s
+    diverged = strays > LARGEST_STRAY * np.linalg.norm(poses.t, axis=1)
+    used = inside & (selection.verdict == IN_USE)
     return bool(used.any() and diverged[used].mean() > FEW_ASTRAY)
 
 
-def _by_states(builder: CoplanarityBuilder, there: Relative, scale: float) -> tuple[Mask, NDArray[np.intp], float]:
+def _by_states(
+    builder: CoplanarityBuilder, pairs: Pairs, there: Relative, scale: float
+) -> tuple[Mask, NDArray[np.intp], float]:
     """Matches (padded) that agree with the smoothed states, the verdict on each pair, and the scale of a match's
     sigma: that of their median, the freedom of each pair's pose taken out."""
-    pairs = builder.pairs
     x0, x1, shift = pairs.matches
     white = np.abs(sampson(there.R, there.t, x0, x1, shift=shift).residual) / builder.sigma
     geometry = Geometry.of(pairs, there.R)
@@ -129,24 +135,24 @@ def account(builders: Iterable[Builder], pass_state: PassState) -> Account | Non
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or builder.replaced(pass_state):
         return None
-    verdict = builder.verdict_of(pass_state)
+    selection = builder.selection(pass_state)
+    verdict = selection.verdict
     count = np.bincount(verdict, minlength=len(REASONS))
-    inside = verdict[builder.pairs.pair] == IN_USE
+    inside = verdict[builder.seen.pair] == IN_USE
     use = builder.used_matches(pass_state)
-    refused = builder.refused if pass_state.outlier_tests else ""
     told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    return Account(told, int(inside.sum()), int((inside & ~use).sum()), refused)
+    return Account(told, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
 
 
-def relative_poses(builder: CoplanarityBuilder, estimate: Estimate) -> tuple[Relative, Mask]:
+def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estimate: Estimate) -> tuple[Relative, Mask]:
     """Relative camera poses of all pairs at an estimate, and which pairs have both keyframes."""
     place, known = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, p, v, _ = (x[place] for x in estimate.states())
     pose = np.tile(np.eye(4), (len(place), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = R, p
-    first, second = builder.pairs.images.T
+    first, second = builder.seen.images.T
     data = np.zeros((len(first), COLUMNS))
-    data[:, 1:4], data[:, 4:7] = builder.rate[first], builder.rate[second]
+    data[:, 1:4], data[:, 4:7] = selection.rate[first], selection.rate[second]
     states = [pose[first], pose[second]]
     if builder.rig.timed:
         states += [v[first], v[second], np.full((len(first), 1), estimate.offset_s(STREAM))]

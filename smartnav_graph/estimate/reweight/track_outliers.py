@@ -18,7 +18,17 @@ from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.factors.camera import BORESIGHT, STREAM
 from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
-from smartnav_graph.factors.smart import CONTRARY, FEW, FLAT, IN_USE, LEAST_SEEN, OUTSIDE, REASONS, SmartBuilder
+from smartnav_graph.factors.smart import (
+    CONTRARY,
+    FEW,
+    FLAT,
+    IN_USE,
+    LEAST_SEEN,
+    OUTSIDE,
+    REASONS,
+    SmartBuilder,
+    TrackSelection,
+)
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.smoothers.estimate import Estimate
@@ -35,38 +45,40 @@ SCALES = (0.3, 3.0)
 
 
 def check_tracks(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
-    """The memory with the tracks that agree with an estimate; unchanged while pairs are not settled, and once tracks
+    """The pass state with the tracks that agree with an estimate; unchanged until pairs are all tested, and once tracks
     are."""
-    found = one_of(builders, SmartBuilder)
-    if found is None or found.refused or pass_state.tests(found.name) >= ROUNDS:
+    found, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
+    if found is None or found.selection(pass_state).refused or pass_state.tests(found.name) >= ROUNDS:
         return pass_state
-    pairs = one_of(builders, CoplanarityBuilder)
-    if pairs is not None and pass_state.tests(pairs.name) < COMPRESSED:
+    if pairs is not None and (pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused):
         return pass_state
-    if pairs is not None and pairs.refused:
-        found.refused = "smart: tracks are refused as the image pairs are"
-        return pass_state
-    return _judged(found, estimate, pass_state)
+    return _tested(found, estimate, pass_state)
 
 
-def _judged(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
-    passed, seen = pass_state.tests(builder.name), builder.sightings
-    if not passed:
-        builder.boresight = estimate.session_value(BORESIGHT, 3)
-    views = _views(builder, estimate)
+def _tested(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
+    tests, seen, before = pass_state.tests(builder.name), builder.sightings, builder.selection(pass_state)
+    if not tests:
+        before = replace(before, boresight=estimate.session_value(BORESIGHT, 3))
+    views = _views(builder, before, estimate)
     use = seen.there & views.known
     points = triangulate(seen, views.then, builder.sigma * pass_state.scale(builder.name), use)
-    builder.use, builder.verdict = points.inside, _verdict(builder, use, points)
-    builder.xy = seen.xy + views.keyframe.project(points.point) - views.then.project(points.point)
-    builder.refused = _refusal(builder.verdict)
-    if builder.refused:
+    verdict = _verdict(builder, use, points)
+    selection = replace(
+        before,
+        use=points.inside,
+        xy=seen.xy + views.keyframe.project(points.point) - views.then.project(points.point),
+        verdict=verdict,
+        refused=_refusal(verdict),
+    )
+    pass_state = replace(pass_state, selections={**pass_state.selections, builder.name: selection})
+    if selection.refused:
         return _without(builder, pass_state)
     states = [estimate.session[s.name] for s in builder.camera_model.states().values() if s.name in estimate.session]
     return replace(
         pass_state,
         fixed_states={**pass_state.fixed_states, **{state.name: state.value for state in states}},
-        noise_scales={**pass_state.noise_scales, builder.name: _scale(builder, points)},
-        outlier_tests={**pass_state.outlier_tests, builder.name: passed + 1},
+        noise_scales={**pass_state.noise_scales, builder.name: _scale(builder, verdict, points)},
+        outlier_tests={**pass_state.outlier_tests, builder.name: tests + 1},
     )
 
 
@@ -88,7 +100,7 @@ class _Views(NamedTuple):
     known: Mask
 
 
-def _views(builder: SmartBuilder, estimate: Estimate) -> _Views:
+def _views(builder: SmartBuilder, selection: TrackSelection, estimate: Estimate) -> _Views:
     seen, stamps = builder.sightings, builder.image_ns
     place, known = estimate.keyframes_at(stamps, builder.merge_ns)
     known[1:] &= place[1:] != place[:-1]  # a keyframe stands for one image
@@ -96,15 +108,15 @@ def _views(builder: SmartBuilder, estimate: Estimate) -> _Views:
     delay = estimate.offset_s(STREAM) + builder.camera_model.delay(seen.xy.reshape(-1, 2))
     turn = builder.rates.turn(stamps[seen.image.ravel()], delay) - bias[:, 3:] * delay[:, None]
     later, on = R @ exp(turn), p + v * delay[:, None]
-    at_once, then = (_camera(builder, *pose) for pose in ((R, p), (later, on)))
+    at_once, then = (_camera(builder, selection, *pose) for pose in ((R, p), (later, on)))
     return _Views(at_once, then, known[seen.image])
 
 
-def _camera(builder: SmartBuilder, R: Floats, p: Floats) -> Cameras:
+def _camera(builder: SmartBuilder, selection: TrackSelection, R: Floats, p: Floats) -> Cameras:
     """Cameras of bodies at R (n l, 3, 3), p (n l, 3)."""
     shape = builder.sightings.image.shape
     place = p + R @ builder.camera_model.rig.body_t_cam
-    return Cameras((R @ builder.body_R_cam).reshape(*shape, 3, 3), place.reshape(*shape, 3))
+    return Cameras((R @ builder.body_R_cam(selection)).reshape(*shape, 3, 3), place.reshape(*shape, 3))
 
 
 def _verdict(builder: SmartBuilder, use: Mask, points: TrackPoints) -> NDArray[np.intp]:
@@ -130,9 +142,9 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
     )
 
 
-def _scale(builder: SmartBuilder, points: TrackPoints) -> float:
+def _scale(builder: SmartBuilder, verdict: NDArray[np.intp], points: TrackPoints) -> float:
     """Scale of the sigma of an observation: the root mean square of those in use, what the points take put back."""
-    tracks = builder.verdict == IN_USE
+    tracks = verdict == IN_USE
     square = (points.residual[points.inside & tracks[:, None]] ** 2).sum() / builder.sigma**2
     left = 2 * int(points.inside[tracks].sum()) - POINT_DOF * int(tracks.sum())
     return float(np.clip(np.sqrt(square / left), *SCALES))
@@ -146,11 +158,11 @@ def whitened(
     builder = one_of(builders, SmartBuilder)
     if builder is None or not builder.in_force(pass_state):
         return None
-    seen = builder.sightings
+    seen, selection = builder.sightings, builder.selection(pass_state)
     sigma = builder.sigma * pass_state.scale(builder.name)
-    points = triangulate(seen, _views(builder, estimate).then, sigma, builder.use)
-    told = seen.there & (builder.verdict == IN_USE)[:, None]
-    return builder.image_ns[seen.image[told]], points.residual[told] / sigma, builder.use[told]
+    points = triangulate(seen, _views(builder, selection, estimate).then, sigma, selection.use)
+    tested = seen.there & (selection.verdict == IN_USE)[:, None]
+    return builder.image_ns[seen.image[tested]], points.residual[tested] / sigma, selection.use[tested]
 
 
 @dataclass(frozen=True)
@@ -181,11 +193,15 @@ class Account:
 
 def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
     """The account of the tracks of a run; None where they are not asked for."""
-    builder = one_of(builders, SmartBuilder)
+    builder, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
     if builder is None:
         return None
-    count = np.bincount(builder.verdict, minlength=len(REASONS))
-    told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    inside = builder.sightings.there & (builder.verdict == IN_USE)[:, None]
-    wrong = int((inside & ~builder.use).sum())
-    return Account(told, int(inside.sum()), wrong, builder.refused, builder.in_force(pass_state))
+    selection, refused = builder.selection(pass_state), ""
+    if pairs is not None and pairs.selection(pass_state).refused:
+        refused = "smart: tracks are refused as the image pairs are"
+    count = np.bincount(selection.verdict, minlength=len(REASONS))
+    by_reason = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+    inside = builder.sightings.there & (selection.verdict == IN_USE)[:, None]
+    wrong = int((inside & ~selection.use).sum())
+    refused = selection.refused or refused
+    return Account(by_reason, int(inside.sum()), wrong, refused, builder.in_force(pass_state))
