@@ -118,13 +118,13 @@ def test_stamps_lie_in_the_window_that_ends_at_their_keyframe():
 
 
 def test_no_update_is_told_that_was_not_taken_in_whole():
-    log, step = diagnostics.UpdateLog(), GraphUpdate(0, 5, 0.0)
     smoother = SimpleNamespace(
         recent=lambda: (np.array([5]), np.zeros((1, 3))), effort=SimpleNamespace(solved=3, relinearised=0)
     )
-    smoother.session_now = dict
-    log.take(step, smoother, 0.001)
+    smoother.session_now, smoother.latest = dict, lambda: SimpleNamespace(t_ns=5)
+    log, step = diagnostics.UpdateLog(smoother), GraphUpdate(0, 5, 0.0)
+    log.take(step, 0.001)
     smoother.session_now = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        log.take(step, smoother, 0.001)
+        log.take(step, 0.001)
     assert len(log.updates().t_ns) == 1
