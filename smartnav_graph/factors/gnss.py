@@ -138,7 +138,7 @@ class PositionBuilder(Builder):
 
     def begin(self) -> PositionBuilder:
         """See `Builder.begin`."""
-        return replace(self, _squares=deque(maxlen=REMEMBERED))
+        return replace(self, _level=PredictionLevel(3))
 
     @classmethod
     def of(

@@ -11,7 +11,7 @@ Source: Groves (2013), Principles of GNSS, inertial and multisensor integrated n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -97,6 +97,10 @@ class RangeBuilder(Builder):
     name: str = NAME
     stage: int = 0
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(1))
+
+    def begin(self) -> RangeBuilder:
+        """See `Builder.begin`."""
+        return replace(self, _level=PredictionLevel(1))
 
     @property
     def gate_probability(self) -> float | None:
