@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -129,8 +128,8 @@ class State:
 
     index: int
     t_ns: int
-    nav: Any
-    bias: Any
+    nav: gtsam.NavState
+    bias: gtsam.imuBias.ConstantBias
     covariance: Floats | None = None
 
     @classmethod

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import gtsam
 import numpy as np
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError, SolverError
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, State, key
 from smartnav_graph.graph.update import GraphUpdate
@@ -78,17 +78,17 @@ class Batch:
 
     config: BatchConfig = field(default_factory=BatchConfig)
     solve: SolveConfig = field(default_factory=SolveConfig)
-    initial_values: Any = None
+    initial_values: gtsam.Values | None = None
     t0_ns: int = 0
     coarse_start: bool = False
     first_s: float = 0.0
     steps: list[GraphUpdate] = field(default_factory=list)
-    values: Any = field(default_factory=gtsam.Values)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
     _settled: int = 0
     _stretch_s: float = 0.0
     _settle_s: float = 0.0
-    _anchor: Any = None
-    _recent: Any = field(default_factory=gtsam.Values)
+    _anchor: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    _recent: gtsam.Values = field(default_factory=gtsam.Values)
 
     def __post_init__(self) -> None:
         self._stretch_s = (
@@ -104,10 +104,10 @@ class Batch:
     def update(self, update: GraphUpdate) -> None:
         """Take one step; settle the latest stretch when it is long enough."""
         self.steps.append(update)
+        known = gtsam.Values() if self.initial_values is None else self.initial_values
         for name, state in update.session.items():
             if not self.values.exists(name):
-                known = self.initial_values is not None and self.initial_values.exists(name)
-                self.values.insert(name, self.initial_values.atVector(name) if known else state.initial)
+                self.values.insert(name, known.atVector(name) if known.exists(name) else state.initial)
         if self.initial_values is not None:
             copy_state(update, self.initial_values, self.values)
             return
@@ -121,7 +121,7 @@ class Batch:
             self._settle(since)
             self._settle_s += time.perf_counter() - begin
 
-    def _share(self, update: GraphUpdate, values: Any) -> None:
+    def _share(self, update: GraphUpdate, values: gtsam.Values) -> None:
         """Give `values` the present session states of a step, where it lacks them."""
         for name in update.session:
             if not values.exists(name):
@@ -155,7 +155,7 @@ class Batch:
             copy_state(self.steps[-1], self.values, self._recent)
             self._stretch_s = self._next_stretch(tree)
 
-    def _next_stretch(self, tree: Any) -> float:
+    def _next_stretch(self, tree: gtsam.GaussianBayesTree) -> float:
         """As long as the gyro bias is unlikely to turn the guess by more than `LARGEST_TURN`."""
         bias = np.diag(tree.marginalCovariance(key("B", self.steps[-1].index)))[3:]
         shortest, longest = SHORTEST_STRETCH * self.config.settle_s, self.config.longest_settle_s
@@ -181,7 +181,7 @@ class Batch:
             order.push_back(name)
         return order
 
-    def _solve_stretch(self, stretch: Sequence[GraphUpdate], values: Any, since: float) -> Solve:
+    def _solve_stretch(self, stretch: Sequence[GraphUpdate], values: gtsam.Values, since: float) -> Solve:
         graph, order = self._stretch_graph(stretch, since), self._order(stretch)
         enough = 0.0 if self.coarse_start else GOOD_COST * len(stretch)
         return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate), enough)
@@ -202,12 +202,12 @@ class Batch:
             values = solve.values
         return solve
 
-    def _refresh(self, values: Any) -> bool:
+    def _refresh(self, values: gtsam.Values) -> bool:
         """Preintegrate again where the bias has left its linearisation point; whether any window did."""
         fresh = [step.refreshed(values.atConstantBias(key("B", before.index))) for before, step in pairwise(self.steps)]
         return any(fresh)
 
-    def _reintegrate(self, candidate: Any) -> Any:
+    def _reintegrate(self, candidate: gtsam.Values) -> gtsam.Values:
         return _shot(self.steps, candidate)
 
     def estimate(self) -> Estimate:
@@ -261,7 +261,7 @@ class Batch:
         self.values = solve.values
         return graph, solve
 
-    def _told(self, solve: Solve, covariance: Any, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
+    def _told(self, solve: Solve, covariance: Floats, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
         return Estimate(
             values=solve.values,
             indices=[update.index for update in self.steps],
@@ -283,20 +283,20 @@ class Batch:
         return indeterminate(error, t_ns, self.t0_ns, touching)
 
 
-def _hold(update: GraphUpdate) -> Any:
+def _hold(update: GraphUpdate) -> gtsam.NonlinearFactor:
     """Keeps the attitude of the first keyframe near its guess: seconds of noisy fixes say nothing of it."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, 0.2)
     return gtsam.PoseRotationPrior3D(key("X", update.index), update.predicted.attitude(), model)
 
 
-def _place(update: GraphUpdate) -> Any:
+def _place(update: GraphUpdate) -> gtsam.NonlinearFactor:
     """Keeps the first keyframe within kilometres of its guess: before the first fix nothing else says where it is, and
     a solve would leave it a million of them away."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, PLACE_M)
     return gtsam.GPSFactor(key("X", update.index), update.predicted.position(), model)
 
 
-def _shot(steps: Sequence[GraphUpdate], values: Any) -> Any:
+def _shot(steps: Sequence[GraphUpdate], values: gtsam.Values) -> gtsam.Values:
     """The states that the first one foretells, all with its bias."""
     state = state_at(values, steps[0].index, steps[0].t_ns)
     nav, bias = state.nav, state.bias
@@ -311,19 +311,19 @@ def _shot(steps: Sequence[GraphUpdate], values: Any) -> Any:
     return reintegrated
 
 
-def _eliminate(linear: Any, order: gtsam.Ordering) -> Any:
+def _eliminate(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering) -> gtsam.GaussianBayesTree:
     try:
         return linear.eliminateMultifrontal(order)
     except RuntimeError:
         return linear.eliminateMultifrontal(order, gtsam.EliminateQR)
 
 
-def _anchor(tree: Any, values: Any, update: GraphUpdate) -> Any:
+def _anchor(tree: gtsam.GaussianBayesTree, values: gtsam.Values, update: GraphUpdate) -> gtsam.NonlinearFactorGraph:
     """Prior factors that stand for everything up to `step`."""
     graph = gtsam.NonlinearFactorGraph()
     pose, velocity, bias = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
 
-    def model(name: int) -> Any:
+    def model(name: int) -> gtsam.noiseModel.Gaussian:
         return gtsam.noiseModel.Gaussian.Covariance(ANCHOR_SLACK * tree.marginalCovariance(name))
 
     graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), model(pose)))
@@ -333,7 +333,7 @@ def _anchor(tree: Any, values: Any, update: GraphUpdate) -> Any:
     return graph
 
 
-def check_covariance(covariance: Any, steps: Sequence[GraphUpdate], t0_ns: int) -> None:
+def check_covariance(covariance: Floats, steps: Sequence[GraphUpdate], t0_ns: int) -> None:
     """Observability: every variance finite and positive, position known better than `LARGEST_VARIANCE`.
 
     Raises

@@ -16,7 +16,9 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
-from smartnav_graph.smoothers.whole_graph import StackedFactors, stacks_of
+from smartnav_graph.smoothers.whole_graph import StackedFactors, WholeGraph, stacks_of
+
+Conditionals = Mapping[int, gtsam.GaussianConditional]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Estimate:
     seconds : wall time by stage
     """
 
-    values: Any
+    values: gtsam.Values
     indices: Sequence[int]
     t_ns: NDArray[np.int64]
     covariance: Floats
@@ -114,7 +116,7 @@ class Estimate:
         return self._states
 
 
-def state_at(values: Any, index: int, t_ns: int) -> State:
+def state_at(values: gtsam.Values, index: int, t_ns: int) -> State:
     """The navigation state and bias of one keyframe."""
     pose = values.atPose3(key("X", index))
     return State(
@@ -122,7 +124,7 @@ def state_at(values: Any, index: int, t_ns: int) -> State:
     )
 
 
-def copy_state(update: GraphUpdate, source: Any, target: Any) -> None:
+def copy_state(update: GraphUpdate, source: gtsam.Values, target: gtsam.Values) -> None:
     """Copy the variables of one step from gtsam.Values to gtsam.Values."""
     x, v, b = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
     target.insert(x, source.atPose3(x))
@@ -132,7 +134,7 @@ def copy_state(update: GraphUpdate, source: Any, target: Any) -> None:
         target.insert(name, source.atVector(name) if source.exists(name) else initial)
 
 
-def states_of(values: Any, indices: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
+def states_of(values: gtsam.Values, indices: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
     """Arrays of the keyframe states; see `Estimate.states`."""
     poses = [values.atPose3(key("X", i)).matrix() for i in indices]
     stacked = np.array(poses).reshape(-1, 4, 4)
@@ -180,12 +182,12 @@ def chronological_order(steps: Sequence[GraphUpdate]) -> gtsam.Ordering:
     return order
 
 
-def eliminated(graph: Any, values: Any, steps: Sequence[GraphUpdate]) -> Any:
+def eliminated(graph: WholeGraph, values: gtsam.Values, steps: Sequence[GraphUpdate]) -> gtsam.GaussianBayesNet:
     """Bayes net of a graph linearised at `values`, in chronological order; QR is exact where states are weakly held."""
     return graph.linearize(values).eliminateSequential(chronological_order(steps), gtsam.EliminateQR)
 
 
-def posterior(net: Any, steps: Sequence[GraphUpdate]) -> Posterior:
+def posterior(net: gtsam.GaussianBayesNet, steps: Sequence[GraphUpdate]) -> Posterior:
     """Marginals of a Bayes net eliminated in chronological order, session states last; see `joint_covariances`.
 
     Raises
@@ -208,7 +210,7 @@ def posterior(net: Any, steps: Sequence[GraphUpdate]) -> Posterior:
 
 
 def joint_covariances(
-    net: Any, groups: Sequence[Sequence[int]], session: Sequence[int]
+    net: gtsam.GaussianBayesNet, groups: Sequence[Sequence[int]], session: Sequence[int]
 ) -> Iterator[tuple[int, JointCovariance]]:
     """Joint covariance of the session states (row n), then of each of the n groups of states, backwards in time, with
     all later states that a factor shares with it.
@@ -236,7 +238,7 @@ def joint_covariances(
         yield row, found
 
 
-def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
+def latest_covariance(net: gtsam.GaussianBayesNet, names: Sequence[int]) -> Floats:
     """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents."""
     conditionals, missing, place = {}, set(names), net.size()
     while missing:  # one that nothing connects with the rest may stand before it
@@ -247,7 +249,9 @@ def latest_covariance(net: Any, names: Sequence[int]) -> Floats:
     return JointCovariance({}, np.zeros((0, 0))).extended(names, conditionals).covariance
 
 
-def _earliest_users(groups: Sequence[Sequence[int]], conditionals: Mapping[int, Any]) -> dict[int, int]:
+def _earliest_users(
+    groups: Sequence[Sequence[int]], conditionals: Mapping[int, gtsam.GaussianConditional]
+) -> dict[int, int]:
     """The earliest group that is conditioned on each state."""
     found: dict[int, int] = {}
     for row, names in enumerate(groups):
@@ -273,7 +277,7 @@ class JointCovariance:
         """The same without all other states."""
         return self if len(names) == len(self.at) else JointCovariance(_slices(names), self.of(names))
 
-    def extended(self, names: Sequence[int], conditionals: Mapping[int, Any]) -> JointCovariance:
+    def extended(self, names: Sequence[int], conditionals: Conditionals) -> JointCovariance:
         """With the states `names` before these, which they are conditioned on."""
         at = _slices(names)
         size = max(part.stop for part in at.values())
@@ -309,7 +313,7 @@ def _slices(names: Iterable[int]) -> dict[int, slice]:
     return at
 
 
-def session_values(steps: Sequence[GraphUpdate], values: Any, marginals: Posterior) -> dict[str, SessionValue]:
+def session_values(steps: Sequence[GraphUpdate], values: gtsam.Values, marginals: Posterior) -> dict[str, SessionValue]:
     """What was found of every session state, by name."""
     found = {}
     for update in steps:

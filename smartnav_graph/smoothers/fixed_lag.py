@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -48,10 +48,10 @@ class FixedLag(Incremental):
         self._inside: deque[GraphUpdate] = deque()
         self._session: dict[int, SessionState] = {}
         self._held: dict[int, Floats] = {}
-        self._factors: list[tuple[int, Any]] = []
+        self._factors: list[tuple[int, gtsam.NonlinearFactor]] = []
         self._blocks: list[tuple[int, FactorBatch]] = []
         self._live, self._left = gtsam.Values(), gtsam.Values()
-        self._net: Any = None
+        self._net = gtsam.GaussianBayesNet()
         self._weak = True
 
     def _take(self, update: GraphUpdate) -> None:
@@ -155,7 +155,7 @@ class FixedLag(Incremental):
                 start += len(value)
         return found
 
-    def values(self) -> Any:
+    def values(self) -> gtsam.Values:
         """Best estimate of every state so far (gtsam.Values): as it left the lag, or as it is now."""
         values = gtsam.Values(self._left)
         values.insert(self._live)
@@ -167,7 +167,7 @@ def _own(update: GraphUpdate) -> list[int]:
     return [key(letter, update.index) for letter in KEYFRAME_LETTERS]
 
 
-def _eliminated(linear: Any, order: gtsam.Ordering, weak: bool) -> Any:
+def _eliminated(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, weak: bool) -> gtsam.GaussianBayesNet:
     """Bayes net of a linear system; RuntimeError also where a state has no factor at all."""
     try:
         if not weak:
@@ -211,7 +211,7 @@ def _parted(block: FactorBatch) -> list[tuple[int, FactorBatch]]:
     return [(index, _only(block, [o == index for o in oldest])) for index in dict.fromkeys(oldest) if index is not None]
 
 
-def _check(delta: Any, names: Sequence[int]) -> None:
+def _check(delta: gtsam.VectorValues, names: Sequence[int]) -> None:
     """Refuse a step that is no number: a state is not determined."""
     if not np.isfinite(delta.vector()).all():
         bad = next(name for name in names if not np.isfinite(delta.at(name)).all())

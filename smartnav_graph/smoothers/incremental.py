@@ -5,8 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,7 +77,7 @@ class Incremental(ABC):
         """(15, 15) covariance of the latest keyframe on GTSAM's tangents."""
 
     @abstractmethod
-    def values(self) -> Any:
+    def values(self) -> gtsam.Values:
         """Best estimate of every state so far (gtsam.Values)."""
 
     @abstractmethod

@@ -8,8 +8,6 @@ Source: Kaess, Johannsson, Roberts, Ila, Leonard, Dellaert (2012), iSAM2, IJRR 3
 
 from __future__ import annotations
 
-from typing import Any
-
 import gtsam
 import numpy as np
 from scipy.linalg import block_diag
@@ -78,6 +76,6 @@ class Isam2(Incremental):
             found |= scalars(state, value, np.full(len(value), np.nan))
         return found
 
-    def values(self) -> Any:
+    def values(self) -> gtsam.Values:
         """Best estimate of every state so far (gtsam.Values)."""
         return self._engine.calculateBestEstimate()

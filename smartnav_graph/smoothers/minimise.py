@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
 
 from smartnav_graph.core.errors import ConfigError, SolverError
 from smartnav_graph.graph.states import STATES, kind_of
+from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ FIRST = SolveConfig(max_iterations=40, tolerance=1e-4, step_tolerance=1e-2)
 class Solve:
     """Result of `minimise`."""
 
-    values: Any
+    values: gtsam.Values
     cost: float
     iterations: int
     converged: bool
 
 
 def minimise(
-    graph: Any,
-    values: Any,
+    graph: WholeGraph,
+    values: gtsam.Values,
     order: gtsam.Ordering,
     config: SolveConfig,
-    reintegrate: Callable[[Any], Any] | None = None,
+    reintegrate: Callable[[gtsam.Values], gtsam.Values] | None = None,
     enough: float = 0.0,
 ) -> Solve:
     """Levenberg-Marquardt with Gauss-Newton steps first; ends at once at a cost of `enough`.
@@ -103,7 +103,9 @@ def minimise(
     return Solve(values, cost, iterations, converged)
 
 
-def _better(graph: Any, candidate: Any, cost: float, reintegrate: Callable[[Any], Any] | None) -> tuple[Any, float]:
+def _better(
+    graph: WholeGraph, candidate: gtsam.Values, cost: float, reintegrate: Callable[[gtsam.Values], gtsam.Values] | None
+) -> tuple[gtsam.Values, float]:
     """The candidate, or its shot where the candidate does not lower the cost; infinite where that is not finite."""
     own = graph.error(candidate)
     if reintegrate is None or own < cost:
@@ -115,7 +117,7 @@ def _better(graph: Any, candidate: Any, cost: float, reintegrate: Callable[[Any]
     return best, new_cost
 
 
-def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
+def _step(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, damping: float) -> gtsam.VectorValues:
     if damping:
         linear = linear.clone()
         damper = {
@@ -136,6 +138,6 @@ def _step(linear: Any, order: gtsam.Ordering, damping: float) -> Any:
         return linear.optimize(order, gtsam.EliminateQR)
 
 
-def _stationary(linear: Any, order: gtsam.Ordering) -> bool:
+def _stationary(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering) -> bool:
     """Whether the undamped step is negligible: nothing lowers the cost because it is lowest already."""
     return bool(np.abs(_step(linear, order, 0.0).vector()).max() < 1e-4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -18,7 +17,7 @@ from smartnav_graph.graph.update import FactorBatch, GraphUpdate, Measured, RowM
 Held = Mapping[int, Floats]
 
 
-def value_of(values: Any, letter: str, name: int) -> Floats:
+def value_of(values: gtsam.Values, letter: str, name: int) -> Floats:
     """A state as an array: pose (4, 4), anything else (n,)."""
     if letter == "X":
         return np.asarray(values.atPose3(name).matrix())
@@ -31,7 +30,7 @@ class Snapshot:
     """States of gtsam.Values as arrays, each fetched once; held states stand at their constants. What stacks are
     linearised to there is kept: a candidate whose cost was found is what the next step is taken from."""
 
-    def __init__(self, values: Any, held: Held) -> None:
+    def __init__(self, values: gtsam.Values, held: Held) -> None:
         self.values = values
         self._found: dict[int, Floats] = dict(held)
         self._linear: dict[int, tuple[Floats, list[Floats]]] = {}
@@ -75,7 +74,7 @@ class StackedFactors:
         """Weight (m,) of the loss on whitened residuals (m, d)."""
         return loss_weights((residual**2).sum(axis=1), self.loss, self.reach, residual.shape[1])[0]
 
-    def linearize(self, values: Any) -> tuple[Floats, list[Floats]]:
+    def linearize(self, values: gtsam.Values | Snapshot) -> tuple[Floats, list[Floats]]:
         """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss.
 
         values : gtsam.Values, or a `Snapshot` that stacks share
@@ -87,7 +86,7 @@ class StackedFactors:
         columns = zip(self.model.letters, zip(*self.keys, strict=True), strict=True)
         return [snapshot.column(letter, names) for letter, names in columns]
 
-    def measured(self, values: Any) -> Measured:
+    def measured(self, values: gtsam.Values) -> Measured:
         """Every measurement by itself: the rows, or what they stand for."""
         if hasattr(self.model, "measured"):
             found: Measured = self.model.measured(self.states(Snapshot(values, self.held)), self.data)
@@ -95,7 +94,7 @@ class StackedFactors:
         white, _ = self.linearize(values)
         return Measured(np.arange(len(white)), white, self.weight(white), self.used)
 
-    def sizes(self, values: Any) -> Floats:
+    def sizes(self, values: gtsam.Values) -> Floats:
         """Norm (m,) of each whitened row; of one that stands for many measurements, their median."""
         found = self.measured(values)
         norm = np.linalg.norm(found.white, axis=1)
@@ -103,13 +102,13 @@ class StackedFactors:
             return np.asarray(norm)
         return np.array([np.median(norm[found.row == row]) for row in range(len(self.keys))])
 
-    def cost(self, values: Any) -> float:
+    def cost(self, values: gtsam.Values | Snapshot) -> float:
         """Half the sum of squares of the used rows, under the loss."""
         residual = self.linearize(values)[0][self.used]
         square, dim = (residual**2).sum(axis=1), residual.shape[1]
         return float(loss_weights(square, self.loss, self.reach[self.used], dim)[1].sum())
 
-    def add_to(self, linear: Any, values: Any) -> None:
+    def add_to(self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values | Snapshot) -> None:
         """Append one linear factor a used row; held states and states that nothing depends on have no column."""
         residual, jacobians = self.linearize(values)
         root = np.sqrt(self.weight(residual))
@@ -122,7 +121,7 @@ class StackedFactors:
             linear.push_back(linear_factor([keys[i] for i in free], dims, augmented[row]))
 
 
-def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -> Any:
+def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -> gtsam.GaussianConditional:
     """sum A_i x_i = b from [A_1 ... A_n b] (d, sum of dims): a JacobianFactor of any number of terms.
 
     JacobianFactor's own constructor takes three terms at most. A GaussianConditional is a JacobianFactor, and GTSAM
@@ -144,7 +143,7 @@ def stacks_of(blocks: Iterable[FactorBatch], held: Held) -> list[StackedFactors]
 class WholeGraph:
     """What `minimise` needs of a graph: `linearize` and `error`."""
 
-    def __init__(self, factors: Iterable[Any], blocks: Iterable[FactorBatch], held: Held) -> None:
+    def __init__(self, factors: Iterable[gtsam.NonlinearFactor], blocks: Iterable[FactorBatch], held: Held) -> None:
         self.native = gtsam.NonlinearFactorGraph()
         for factor in factors:
             self.native.push_back(factor)
@@ -164,26 +163,26 @@ class WholeGraph:
         factors = [factor for update in steps for _, factor in update.factors]
         return cls(factors + priors, [block for update in steps for block in update.blocks], held)
 
-    def linearize(self, values: Any) -> Any:
+    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""
         linear, snapshot = self.native.linearize(values), self._snapshot(values)
         for stack in self.stacks:
             stack.add_to(linear, snapshot)
         return linear
 
-    def error(self, values: Any) -> float:
+    def error(self, values: gtsam.Values) -> float:
         """Half the sum of weighted squares."""
         snapshot = self._snapshot(values)
-        return float(self.native.error(values)) + sum(stack.cost(snapshot) for stack in self.stacks)
+        return float(self.native.error(values) + sum(stack.cost(snapshot) for stack in self.stacks))
 
-    def _snapshot(self, values: Any) -> Snapshot:
+    def _snapshot(self, values: gtsam.Values) -> Snapshot:
         """The snapshot of the same values that was looked at last, or a new one; nobody changes values in between."""
         if self._last is None or self._last.values is not values:
             self._last = Snapshot(values, self.held)
         return self._last
 
 
-def session_prior(state: SessionState) -> Any:
+def session_prior(state: SessionState) -> gtsam.PriorFactorVector:
     """Prior factor of a session state."""
     return gtsam.PriorFactorVector(state.key, state.initial, gtsam.noiseModel.Diagonal.Sigmas(state.sigma))
 
@@ -192,12 +191,12 @@ def session_prior(state: SessionState) -> Any:
 _SIZES: dict[RowModel, int] = {}
 
 
-def custom_factor(block: FactorBatch, row: int, held: Held) -> Any:
+def custom_factor(block: FactorBatch, row: int, held: Held) -> gtsam.CustomFactor:
     """One row of a block as a gtsam.CustomFactor on the states that are not held."""
     model, keys, data = block.model, block.keys[row], block.data[row : row + 1]
     free = [i for i, k in enumerate(keys) if k not in held]
 
-    def error(this: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         states = [
             (held[k] if k in held else value_of(values, letter, k))[None]
             for letter, k in zip(model.letters, keys, strict=True)

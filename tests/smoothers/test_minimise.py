@@ -150,5 +150,5 @@ def test_an_unheld_state_is_refused():
 
 @pytest.mark.parametrize("field", ["max_iterations", "tolerance", "step_tolerance"])
 def test_options(field):
-    with pytest.raises(ConfigError, match=r"config \[solve\]"):
+    with pytest.raises(ConfigError, match=r"config \[solver\]"):
         SolveConfig(**{field: 0})

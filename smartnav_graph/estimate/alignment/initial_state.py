@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from smartnav_graph.core.errors import ConfigError
@@ -72,7 +73,7 @@ class InitialState:
     stretch_s: float
     starts: int
     pass_state: PassState
-    initial_values: Any = None
+    initial_values: gtsam.Values | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return {

@@ -76,7 +76,7 @@ def to_solution(solved: SolvedProblem) -> Solution:
     return replace(solution, residuals=residuals(solved))
 
 
-def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]) -> Any:
+def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]) -> gtsam.Values:
     """An estimate as gtsam.Values for other windows of the same stretch: states as foretold inside its own windows,
     session states as they are."""
     t_ns = np.array([window.t1_ns for window in windows], dtype=np.int64)

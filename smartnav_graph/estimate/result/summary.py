@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import resource
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -26,6 +27,7 @@ from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
 from smartnav_graph.factors.gauss_markov import wander_sigma
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.solution import POS, Solution
+from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers.estimate import Estimate
 
 PACKAGES = ("smartnav-graph", "gtsam", "numpy", "scipy", "opencv-python-headless", "pycolmap", "rerun-sdk")
@@ -77,36 +79,23 @@ def summarise(
 ) -> dict[str, Any]:
     """The content of summary.json; `extra` overrides and adds."""
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
-    t0 = problem.session.t0_ns
     duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
-    factors: dict[str, int] = {}
-    for tag, _ in estimate.factors:
-        factors[tag.sensor] = factors.get(tag.sensor, 0) + 1
-    for block in estimate.blocks:
-        factors[block.sensor] = factors.get(block.sensor, 0) + len(block.keys)
     absolute = bool(used_counts(problem, pass_state))
     seen, tracks = account(problem.builders, pass_state), track_outliers.account(problem.builders, pass_state)
     fit = chi2_of(solved, keyframes, tracks)
     chi2 = fit.per_dof()
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
-    told = [one.refused for one in (seen, tracks) if one is not None and one.refused]
-    warnings = [*problem.warnings, *told, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
+    refused = [one.refused for one in (seen, tracks) if one is not None and one.refused]
+    warnings = [*problem.warnings, *refused, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
     summary: dict[str, Any] = {
         "mode": "batch" if absolute else "dead-reckoning",
         "vehicle": problem.vehicle,
-        "session": {
-            "device": problem.session.device.name,
-            "clock_epoch": problem.session.clock_epoch,
-            "t0_ns": t0,
-            "forward": problem.session.device.forward,
-            "up": problem.session.device.up,
-            "gravity_m_s2": problem.session.gravity,
-        },
+        "session": _session(problem.session),
         "duration_s": duration,
         "path_m": keyframes.path_length(),
         "keyframes": len(keyframes),
-        "factors": factors,
+        "factors": _factor_counts(estimate),
         "chi2_per_dof": chi2,
         "redundancy": {name: round(part.redundancy, 3) for name, part in fit.parts.items()},
         "without_chi2": fit.reasons(),
@@ -117,10 +106,7 @@ def summarise(
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),
-        "gaps": [
-            {"start_s": round((gap.start_ns - t0) / 1e9, 3), "length_s": round(gap.length_s, 3), "kind": gap.kind}
-            for gap in problem.gaps
-        ],
+        "gaps": _gaps(problem),
         "standstills": _standstills(problem),
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used_counts(problem, pass_state)),
@@ -135,6 +121,33 @@ def summarise(
         "versions": versions(),
     }
     return summary | dict(extra)
+
+
+def _session(session: Session) -> dict[str, Any]:
+    return {
+        "device": session.device.name,
+        "clock_epoch": session.clock_epoch,
+        "t0_ns": session.t0_ns,
+        "forward": session.device.forward,
+        "up": session.device.up,
+        "gravity_m_s2": session.gravity,
+    }
+
+
+def _factor_counts(estimate: Estimate) -> dict[str, int]:
+    """Factors, and rows of blocks, by sensor."""
+    counts = Counter(tag.sensor for tag, _ in estimate.factors)
+    for block in estimate.blocks:
+        counts[block.sensor] += len(block.keys)
+    return dict(counts)
+
+
+def _gaps(problem: Problem) -> list[dict[str, Any]]:
+    t0 = problem.session.t0_ns
+    return [
+        {"start_s": round((gap.start_ns - t0) / 1e9, 3), "length_s": round(gap.length_s, 3), "kind": gap.kind}
+        for gap in problem.gaps
+    ]
 
 
 def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outliers.Account | None) -> dict[str, int]:
