@@ -21,8 +21,6 @@ from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.stream import Located, Positioned
 from smartnav_graph.session.streams import Imu, Streams
 
-SCHEMA = 1
-PICTURES = "images"  # the folder of the pictures in that of the session
 GPS_EPOCH_S = 315_964_800
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
