@@ -15,6 +15,7 @@ from smartnav_graph.estimate.run import initialise
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import build_update
+from smartnav_graph.smoothers import batch
 from smartnav_graph.smoothers.batch import Batch, BatchConfig, check_covariance
 from smartnav_graph.smoothers.minimise import SolveConfig
 
@@ -103,3 +104,19 @@ def test_variances_that_cannot_be(problem, prior, value):
 def test_options(settle_s, longest_s):
     with pytest.raises(ConfigError, match="settle_s"):
         BatchConfig(settle_s, longest_s)
+
+
+def test_the_prior_of_a_new_stretch_has_the_marginals_of_the_last_keyframe_times_one_and_a_half(problem, prior):
+    """A linearised covariance is optimistic, so it is widened: by 1.5 in variance, no more and no less."""
+    whole = fill(problem, prior, Batch(BatchConfig(1000.0, 1000.0)))
+    solved = whole.estimate()
+    graph = gtsam.NonlinearFactorGraph()
+    for _, factor in solved.factors:
+        graph.push_back(factor)
+    linear = graph.linearize(solved.values)
+    tree, marginals = linear.eliminateMultifrontal(), gtsam.Marginals(graph, solved.values)
+    last = whole.steps[-1]
+    for factor in map(batch._anchor(tree, solved.values, last).at, range(3)):
+        (name,) = factor.keys()
+        ratio = factor.noiseModel().covariance() / marginals.marginalCovariance(name)
+        np.testing.assert_allclose(np.diag(ratio), 1.5, rtol=1e-6)

@@ -51,6 +51,18 @@ def test_withheld_rows_are_predicted_through_the_lever_arm():
     assert np.median(np.linalg.norm(wrong - right, axis=1)) > 0.5 * np.linalg.norm(LEVER)
 
 
+@pytest.mark.parametrize("offset_s", [0.2, -0.2])
+def test_withheld_rows_are_predicted_at_their_time_offset(offset_s):
+    """Exact data: a stamp t of the receiver is IMU time t + offset. With the wrong sign of the offset the errors are
+    the motion in 0.4 s, about half a metre."""
+    session = record(fix_sigma=0.05).session.replace(control=None)
+    shifted = replace(session.gnss, t_ns=session.gnss.t_ns - round(offset_s * NS))
+    run = sn.run(session.replace(gnss=shifted), withhold=("gnss:every=2",))
+    assert run.summary["states"]["gnss_time_offset_s"]["value"] == pytest.approx(offset_s, abs=0.02)  # s
+    held = run.summary["withheld"]["gnss"]
+    assert held["count"] >= 14 and held["max_m"] < 0.05
+
+
 def test_withheld_rows_beyond_the_keyframes_are_not_scored(eight):
     run = sn.run(eight, withhold=("gnss:every=2",), end_s=30.0)
     assert run.summary["withheld"]["gnss"]["count"] == 15
