@@ -21,7 +21,7 @@ FOLDERS, FILE_LINES, FUNCTION_LINES = 13, 400, 60
 ANY = 406  # uses of typing.Any in the package; lower it whenever the count falls
 
 # Still longer; only ever take entries out.
-LONG_FILES = {"estimate/alignment/initialiser.py"}
+LONG_FILES: set[str] = set()
 LONG_FUNCTIONS = {"evaluate"}
 # One role, of which every module of a kind has its own; they are called by the name of the module.
 SAME_ROLE = {"build", "draw", "dumps", "from_dict", "load", "read", "replay", "save", "smooth", "write"}

@@ -26,7 +26,7 @@ from smartnav_graph.vision.zero_motion import static_periods
 
 @dataclass
 class Notes:
-    """What the steps find out beside the session.
+    """What the steps find beside the session.
 
     span : first and last stamp to smooth; gaps : of the inertial data inside it
     withheld : rows held out, by stream; dropped : rows that are not used, by stream and reason

@@ -1,4 +1,4 @@
-"""All steps at once, with the stretches in between settled on the way so that no guess is a mere dead reckoning."""
+"""All updates at once; segments are solved as they come, so that no initial value is a mere dead reckoning."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ ANCHOR_SLACK = 1.5
 
 @dataclass
 class Batch:
-    """Collects steps; `estimate` solves them.
+    """Collects updates; `estimate` solves them.
 
-    warm : values of an earlier pass, taken for every state they hold; unsure : the first state is a mere guess;
-    first_s : stretch that the first state is known to hold for, settled as a whole
+    initial_values : of an earlier pass, taken for every state they hold; coarse_start : the first state is an initial
+    guess; first_s : length of the segment that the first state was found on, solved as a whole
     """
 
     config: BatchConfig = field(default_factory=BatchConfig)
@@ -96,13 +96,13 @@ class Batch:
         )
 
     def latest(self) -> State | None:
-        """Latest state: of the warm values, of the last settled stretch, or predicted since then."""
+        """Latest state: of the initial values, of the last solved segment, or predicted since then."""
         if not self.steps:
             return None
         return state_at(self.values, self.steps[-1].index, self.steps[-1].t_ns)
 
     def update(self, update: GraphUpdate) -> None:
-        """Take one step; settle the latest stretch when it is long enough."""
+        """Take one update; solve the latest segment when it is long enough."""
         self.steps.append(update)
         known = gtsam.Values() if self.initial_values is None else self.initial_values
         for name, state in update.session.items():
@@ -122,15 +122,15 @@ class Batch:
             self._settle_s += time.perf_counter() - begin
 
     def _share(self, update: GraphUpdate, values: gtsam.Values) -> None:
-        """Give `values` the present session states of a step, where it lacks them."""
+        """Give `values` the present session states of an update, where it lacks them."""
         for name in update.session:
             if not values.exists(name):
                 values.insert(name, self.values.atVector(name))
 
     def _settle(self, since: float) -> None:
-        """Solve the steps since the last settled one, held there by its marginals.
+        """Solve the updates since the last segment, held there by its marginals.
 
-        Where the first state is unsure its stretch grows by doubling from the beginning: an unknown gyro bias turns a
+        Where the first state is a guess its segment grows by doubling from the beginning: an unknown gyro bias turns a
         dead-reckoned guess away before there are enough fixes to stop it.
         """
         stretch = self.steps[self._settled :]
@@ -184,10 +184,10 @@ class Batch:
     def _solve_stretch(self, stretch: Sequence[GraphUpdate], values: gtsam.Values, since: float) -> Solve:
         graph, order = self._stretch_graph(stretch, since), self._order(stretch)
         enough = 0.0 if self.coarse_start else GOOD_COST * len(stretch)
-        return minimise(graph, values, order, COARSE, lambda candidate: _shot(stretch, candidate), enough)
+        return minimise(graph, values, order, COARSE, lambda candidate: _reintegrated(stretch, candidate), enough)
 
     def _lengthened(self, stretch: Sequence[GraphUpdate], since: float) -> Solve:
-        """Solve a stretch from its beginning in doubling parts, each foretold from the part before."""
+        """Solve a stretch from its beginning in doubling parts, each predicted from the part before."""
         values, size, solve = gtsam.Values(), GROW_FROM, None
         copy_state(stretch[0], self._recent, values)
         while solve is None or size < len(stretch):
@@ -198,7 +198,7 @@ class Batch:
                     copy_state(step, self._recent, values)
                     self._share(step, values)
             known = 0 if solve is None else size // 2 - 1
-            solve = self._solve_stretch(part, _shot(part[known:], values), since)
+            solve = self._solve_stretch(part, _reintegrated(part[known:], values), since)
             values = solve.values
         return solve
 
@@ -208,7 +208,7 @@ class Batch:
         return any(fresh)
 
     def _reintegrate(self, candidate: gtsam.Values) -> gtsam.Values:
-        return _shot(self.steps, candidate)
+        return _reintegrated(self.steps, candidate)
 
     def estimate(self) -> Estimate:
         """Solve everything.
@@ -228,7 +228,7 @@ class Batch:
             raise self._explain(error) from error
         check_covariance(covariance, self.steps, self.t0_ns)
         seconds = {"solve": self._settle_s + solved - begin, "covariance": time.perf_counter() - solved}
-        return self._told(solve, covariance, marginals, seconds)
+        return self._result(solve, covariance, marginals, seconds)
 
     def provisional(self) -> Estimate:
         """Solve everything coarsely, without any covariance (zeros); errors as `estimate`."""
@@ -240,10 +240,10 @@ class Batch:
         self._settle_s += time.perf_counter() - begin
         none = np.zeros((len(self.steps), 15, 15))
         blank = {name: np.zeros((len(state.initial),) * 2) for name, state in session_states(self.steps).items()}
-        return self._told(solve, none, Posterior(none, none[1:], blank), {})
+        return self._result(solve, none, Posterior(none, none[1:], blank), {})
 
     def renewed(self, renew: Callable[[GraphUpdate], None]) -> None:
-        """Change what the steps add; a session state that comes with it begins at its prior mean."""
+        """Change what the updates add; a session state that comes with it begins at its prior mean."""
         for update in self.steps:
             renew(update)
             for name, state in update.session.items():
@@ -261,7 +261,7 @@ class Batch:
         self.values = solve.values
         return graph, solve
 
-    def _told(self, solve: Solve, covariance: Floats, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
+    def _result(self, solve: Solve, covariance: Floats, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
         return Estimate(
             values=solve.values,
             indices=[update.index for update in self.steps],
@@ -296,8 +296,8 @@ def _place(update: GraphUpdate) -> gtsam.NonlinearFactor:
     return gtsam.GPSFactor(key("X", update.index), update.predicted.position(), model)
 
 
-def _shot(steps: Sequence[GraphUpdate], values: gtsam.Values) -> gtsam.Values:
-    """The states that the first one foretells, all with its bias."""
+def _reintegrated(steps: Sequence[GraphUpdate], values: gtsam.Values) -> gtsam.Values:
+    """The states predicted from the first one, all with its bias."""
     state = state_at(values, steps[0].index, steps[0].t_ns)
     nav, bias = state.nav, state.bias
     reintegrated = gtsam.Values(values)
@@ -319,7 +319,7 @@ def _eliminate(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering) -> gtsa
 
 
 def _anchor(tree: gtsam.GaussianBayesTree, values: gtsam.Values, update: GraphUpdate) -> gtsam.NonlinearFactorGraph:
-    """Prior factors that stand for everything up to `step`."""
+    """Prior factors in place of everything up to `update`."""
     graph = gtsam.NonlinearFactorGraph()
     pose, velocity, bias = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
 

@@ -125,7 +125,7 @@ def state_at(values: gtsam.Values, index: int, t_ns: int) -> State:
 
 
 def copy_state(update: GraphUpdate, source: gtsam.Values, target: gtsam.Values) -> None:
-    """Copy the variables of one step from gtsam.Values to gtsam.Values."""
+    """Copy the variables of one update from gtsam.Values to gtsam.Values."""
     x, v, b = (key(letter, update.index) for letter in KEYFRAME_LETTERS)
     target.insert(x, source.atPose3(x))
     target.insert(v, source.atVector(v))
@@ -164,7 +164,7 @@ def distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, flo
 
 
 def session_states(steps: Iterable[GraphUpdate]) -> dict[int, SessionState]:
-    """The free session states that steps touch, by key."""
+    """The free session states that updates touch, by key."""
     found: dict[int, SessionState] = {}
     for update in steps:
         found |= update.session
@@ -241,7 +241,7 @@ def joint_covariances(
 def latest_covariance(net: gtsam.GaussianBayesNet, names: Sequence[int]) -> Floats:
     """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents."""
     conditionals, missing, place = {}, set(names), net.size()
-    while missing:  # one that nothing connects with the rest may stand before it
+    while missing:  # one that nothing connects with the rest may come before it
         place -= 1
         conditional = net.at(place)
         conditionals[conditional.keys()[0]] = conditional
@@ -304,7 +304,7 @@ class JointCovariance:
 
 
 def _slices(names: Iterable[int]) -> dict[int, slice]:
-    """Where each state stands in a joint vector."""
+    """Rows of each state in a joint vector."""
     at, start = {}, 0
     for name in names:
         size = kind_of(name).dim

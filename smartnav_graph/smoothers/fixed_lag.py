@@ -1,4 +1,4 @@
-"""The last seconds of the graph, solved anew at every step; what is older is marginalised into a linear factor.
+"""The last seconds of the graph, solved again at every update; what is older is marginalised into a linear factor.
 
 A window of seconds holds some ten to fifty keyframes: linearised as a whole, blocks by the stack, and eliminated in
 time order, it costs a few milliseconds whatever has moved, session states included. By QR while position or attitude
@@ -29,9 +29,9 @@ Item = TypeVar("Item")
 
 # Sigmas of position (m) and attitude (rad) beyond which QR is needed.
 WEAK_M, WEAK_RAD = 100.0, 0.5
-# Gauss-Newton steps at most a step: the next one goes on from there.
-MOST_STEPS = 2
-# Share of a state's trust that a step may move it by and need no further one.
+# Gauss-Newton iterations at most an update: the next one goes on from there.
+MOST_ITERATIONS = 2
+# Share of a state's damping scale that an iteration may move it by without a further one.
 SETTLED = 0.05
 # In place of the oldest keyframe where a factor touches session states alone: it never leaves.
 NEVER = 1 << 62
@@ -40,7 +40,7 @@ NEVER = 1 << 62
 class FixedLag(Incremental):
     """Sliding window behind the one interface.
 
-    Live factors and blocks stand with the oldest keyframe they touch, which takes them along when it leaves.
+    Live factors and blocks belong to the oldest keyframe they touch, which takes them along when it leaves.
     """
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
@@ -62,7 +62,7 @@ class FixedLag(Incremental):
         order = self._order()
         names = list(self._live.keys())
         damping_scale = np.concatenate([kind_of(name).damping_scale for name in names])
-        for count in range(1, MOST_STEPS + 1):
+        for count in range(1, MOST_ITERATIONS + 1):
             self._net = _eliminated(graph.linearize(self._live), order, self._weak)
             delta = self._net.optimize()
             _check(delta, names)
@@ -72,7 +72,7 @@ class FixedLag(Incremental):
                 break
 
     def _insert(self, update: GraphUpdate) -> None:
-        """Make the step's states and factors live; a session state comes with its prior, once."""
+        """Make the update's states and factors live; a session state comes with its prior, once."""
         self._inside.append(update)
         self._live.insert(update.values())
         self._held |= update.held
@@ -86,7 +86,7 @@ class FixedLag(Incremental):
             self._blocks += _parted(block)
 
     def _drop_late(self, update: GraphUpdate) -> None:
-        """Leave out, and count, rows that speak of keyframes which have left the lag."""
+        """Leave out, and count, rows of keyframes which have left the lag."""
         oldest = self._inside[0].index if self._inside else update.index
         kept = []
         for block in update.blocks:
@@ -174,7 +174,7 @@ def _eliminated(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, weak: 
             try:
                 return linear.eliminateSequential(order)
             except RuntimeError:
-                pass  # QR is the judge
+                pass  # QR decides
         return linear.eliminateSequential(order, gtsam.EliminateQR)
     except ValueError as error:
         missing = sorted({order.at(i) for i in range(order.size())} - set(linear.keys()))

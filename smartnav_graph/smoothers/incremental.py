@@ -1,4 +1,4 @@
-"""Smoothers that take one step at a time: what they share, and their options."""
+"""Smoothers that take one update at a time: what they share, and their options."""
 
 from __future__ import annotations
 
@@ -54,8 +54,10 @@ class Effort(NamedTuple):
 
 
 class Incremental(ABC):
-    """A smoother that is right after every step. `dropped` counts rows, by sensor, that came too late for it; `effort`
-    is that of the last step."""
+    """A smoother that is right after every update.
+
+    dropped : rows older than its lag, by sensor; effort : of the last update
+    """
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         self.config, self.t0_ns = config, t0_ns
@@ -66,7 +68,7 @@ class Incremental(ABC):
 
     @abstractmethod
     def _take(self, update: GraphUpdate) -> None:
-        """Solve with one step more; RuntimeError where a state is not determined."""
+        """Solve with one update more; RuntimeError where a state is not determined."""
 
     @abstractmethod
     def _state(self, update: GraphUpdate) -> State:
@@ -95,7 +97,7 @@ class Incremental(ABC):
         return np.array(t_ns, dtype=np.int64), np.array(position)
 
     def update(self, update: GraphUpdate) -> None:
-        """Take one step.
+        """Take one update.
 
         Raises
         ------

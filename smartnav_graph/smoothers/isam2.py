@@ -1,7 +1,7 @@
 """iSAM2 over everything.
 
-QR factorisation, because Cholesky gives up on yaw that is only weakly known. Session states are held unless told
-otherwise: one that touches every step makes each update as long as the whole session.
+QR factorisation, because Cholesky gives up on yaw that is only weakly known. Session states are held by
+default: one that touches every update makes each update as long as the whole session.
 
 Source: Kaess, Johannsson, Roberts, Ila, Leonard, Dellaert (2012), iSAM2, IJRR 31(2).
 """
@@ -20,7 +20,7 @@ from smartnav_graph.smoothers.whole_graph import custom_factor, session_prior
 
 
 def isam2_params(factor: float) -> gtsam.ISAM2Params:
-    """iSAM2 with QR and relinearisation at every step that needs it."""
+    """iSAM2 with QR and relinearisation at every update that needs it."""
     thresholds = gtsam.ISAM2ThresholdMap()
     for letter, kind in STATES.items():
         thresholds.insert((letter, factor * kind.relinearize_threshold))

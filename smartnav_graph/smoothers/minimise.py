@@ -68,8 +68,8 @@ def minimise(
 ) -> Solve:
     """Levenberg-Marquardt with Gauss-Newton steps first; ends at once at a cost of `enough`.
 
-    `reintegrate` replaces the states of a candidate by those its first state foretells. Where a step fails only because
-    rotations far along the stretch turn on curves (an unknown gyro bias), the shot lands on the valley's floor.
+    `reintegrate` replaces the states of a candidate by those predicted from its first state. Where a step fails only
+    because rotations far along the segment curve (an unknown gyro bias), reintegration reaches the valley floor.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def minimise(
 def _better(
     graph: WholeGraph, candidate: gtsam.Values, cost: float, reintegrate: Callable[[gtsam.Values], gtsam.Values] | None
 ) -> tuple[gtsam.Values, float]:
-    """The candidate, or its shot where the candidate does not lower the cost; infinite where that is not finite."""
+    """The candidate, reintegrated where it does not lower the cost; the cost is infinite where it is not finite."""
     own = graph.error(candidate)
     if reintegrate is None or own < cost:
         return candidate, own if np.isfinite(own) else np.inf

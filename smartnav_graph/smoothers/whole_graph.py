@@ -27,7 +27,7 @@ def value_of(values: gtsam.Values, letter: str, name: int) -> Floats:
 
 
 class Snapshot:
-    """States of gtsam.Values as arrays, each fetched once; held states stand at their constants. What stacks are
+    """States of gtsam.Values as arrays, each fetched once; held states at their constants. What stacks are
     linearised to there is kept: a candidate whose cost was found is what the next step is taken from."""
 
     def __init__(self, values: gtsam.Values, held: Held) -> None:
@@ -87,7 +87,7 @@ class StackedFactors:
         return [snapshot.column(letter, names) for letter, names in columns]
 
     def measured(self, values: gtsam.Values) -> Measured:
-        """Every measurement by itself: the rows, or what they stand for."""
+        """Every measurement by itself: the rows, or the measurements they combine."""
         if hasattr(self.model, "measured"):
             found: Measured = self.model.measured(self.states(Snapshot(values, self.held)), self.data)
             return found._replace(used=found.used & self.used[found.row])
@@ -95,7 +95,7 @@ class StackedFactors:
         return Measured(np.arange(len(white)), white, self.weight(white), self.used)
 
     def sizes(self, values: gtsam.Values) -> Floats:
-        """Norm (m,) of each whitened row; of one that stands for many measurements, their median."""
+        """Norm (m,) of each whitened row; of one that combines many measurements, their median."""
         found = self.measured(values)
         norm = np.linalg.norm(found.white, axis=1)
         if len(norm) == len(self.keys):
@@ -153,7 +153,7 @@ class WholeGraph:
 
     @classmethod
     def of(cls, steps: Sequence[GraphUpdate]) -> WholeGraph:
-        """Everything that steps add, with the priors of the session states they touch."""
+        """Everything that updates add, with the priors of the session states they touch."""
         session: dict[int, SessionState] = {}
         held: dict[int, Floats] = {}
         for update in steps:
@@ -176,7 +176,7 @@ class WholeGraph:
         return float(self.native.error(values) + sum(stack.cost(snapshot) for stack in self.stacks))
 
     def _snapshot(self, values: gtsam.Values) -> Snapshot:
-        """The snapshot of the same values that was looked at last, or a new one; nobody changes values in between."""
+        """The snapshot of the same values used last, or a new one; values do not change in between."""
         if self._last is None or self._last.values is not values:
             self._last = Snapshot(values, self.held)
         return self._last

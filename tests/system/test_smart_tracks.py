@@ -154,7 +154,7 @@ def test_tracks_that_turn_out_wrong_give_way_to_pairs(solved):
     again = check_tracks([builder, pairs], estimate, first)
     assert not pairs.replaced(again) and not builder.in_force(again)
     assert "images_time_offset_s" not in again.fixed_states and "camera_boresight_rad" not in again.fixed_states
-    assert "too poor to judge them by" in builder.selection(again).refused
+    assert "too poor to test them by" in builder.selection(again).refused
     assert check_tracks([builder, pairs], estimate, again) is again
 
 

@@ -26,13 +26,13 @@ from smartnav_graph.graph import gnc
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import ImuNoise
 
-# What neither curve nor fix knows, metres: lever arms, clock offsets of a tenth of a second, wandering errors.
-UNTOLD = 2.0
-# Noise of what nobody measured inside a gap: m/s^2 and rad/s per sqrt(Hz).
+# Errors (m) that neither curve nor fix models: lever arms, clock offsets of 0.1 s, correlated errors.
+UNMODELLED = 2.0
+# Noise of the unmeasured motion inside a gap: m/s^2 and rad/s per sqrt(Hz).
 GAP_ACCEL, GAP_GYRO = 0.25, 0.05
 KICK_S = 10.0
 LIMIT = float(chi2.ppf(0.999, 3))  # of the squares of fixes that agree
-GROWTH = 1.4  # of the control, a step
+GROWTH = 1.4  # of mu, an iteration
 STEPS = 80
 MOST_FIXES = 300
 SHORT_S, LEAST_FIXES = 12.0, 6  # the first seconds
@@ -42,7 +42,7 @@ BEST = 3  # states that the curve is integrated once more for
 ALIKE = 0.2  # rad, between starts that lead to the same solution
 FIRST_STEPS = 5
 DAMPING = (1e-9, 1e-3, 1e-1, 1e1, 1e3)
-LEAST_CURVATURE = 1e-6  # of a turn that nothing tells
+LEAST_CURVATURE = 1e-6  # of a rotation that is not observable
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class AlignmentProblem:
         return np.concatenate([state.found[:6] - self.curve.bias, state.found[6:]])
 
     def residual(self, state: Alignment) -> tuple[Floats, Floats]:
-        """Whitened residuals (m, 3), and their derivatives (m, 3, 9 + q) by turn (nav), position, velocity, curve."""
+        """Whitened residuals (m, 3), and their derivatives (m, 3, 9 + q) by R (nav), position, velocity, curve."""
         rotate = (self.curve.place + self.curve.by @ self._off(state)) @ state.R.T
         line = state.p + state.v * self.t[:, None]
         line[:, 2] -= 0.5 * self.gravity * self.t**2
@@ -138,15 +138,15 @@ class AlignmentProblem:
         by[:, :, 3:6] = np.eye(3)
         by[:, :, 6:9] = np.eye(3) * self.t[:, None, None]
         by[:, :, 9:] = state.R @ self.curve.by
-        weight = 1.0 / np.hypot(self.sigma, UNTOLD)
+        weight = 1.0 / np.hypot(self.sigma, UNMODELLED)
         return (line + rotate - self.fixes) * weight, by * weight
 
     def start(self, R: Floats, p: Floats, v: Floats) -> Alignment:
         """A state of which the curve knows nothing yet."""
         found = np.concatenate([self.bias_mean, np.zeros(len(self.curve.sigma) - 6)])
-        return self._judged(Alignment(R, p, v, found, self.t))
+        return self._scored(Alignment(R, p, v, found, self.t))
 
-    def _judged(self, state: Alignment) -> Alignment:
+    def _scored(self, state: Alignment) -> Alignment:
         return replace(state, square=(self.residual(state)[0] ** 2).sum(axis=1))
 
     def _prior(self, state: Alignment) -> Floats:
@@ -168,20 +168,20 @@ class AlignmentProblem:
         for damping in DAMPING:
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + LEAST_CURVATURE), gradient)
             R = exp(step[:3]) @ state.R
-            new = self._judged(Alignment(R, state.p + step[3:6], state.v + step[6:9], state.found + step[9:], self.t))
+            new = self._scored(Alignment(R, state.p + step[3:6], state.v + step[6:9], state.found + step[9:], self.t))
             if self._cost(new, weight) <= before:
                 return new
         return state
 
     def thinned(self) -> AlignmentProblem:
-        """With at most so many fixes as tell where the path goes."""
+        """With at most `MOST_FIXES` fixes."""
         rows = np.arange(0, len(self.t), -(-len(self.t) // MOST_FIXES))
         return replace(self, curve=self.curve.at(rows), fixes=self.fixes[rows], t=self.t[rows])
 
     def agree(self, R: Floats, p: Floats, v: Floats) -> Alignment:
         """The state nearest to a start on which most fixes agree."""
         found = _agree(self.thinned(), R, p, v)
-        return self._judged(found)
+        return self._scored(found)
 
 
 def _agree(problem: AlignmentProblem, R: Floats, p: Floats, v: Floats) -> Alignment:
@@ -253,7 +253,7 @@ def starts_agreed(
 ) -> list[Alignment]:
     """The different states that most fixes (m, 3) at t_ns (m,) agree on, cheapest first, from starts (attitude,
     position, velocity). The curve is integrated at `bias` (6,), by default the mean known before, and at that of the
-    first seconds, because a rate wrong by degrees a second bends it beyond what a derivative tells; and for the best
+    first seconds, because a rate wrong by degrees a second bends it beyond what is linear; and for the best
     once more at the bias they found."""
     stretch, points = _Stretch(windows, t_ns, fixes, known), [known.bias_mean if bias is None else bias]
     first = _first_bias(stretch, starts)

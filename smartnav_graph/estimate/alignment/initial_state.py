@@ -1,4 +1,4 @@
-"""What is told of a start, how it is looked for, and what is found."""
+"""What the user gives of the start, options of the initialisation, and its result."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class UserStart:
 
 @dataclass(frozen=True)
 class InitialState:
-    """The first state as a prior, what it rests on, the noise scales found on the way, and values to begin from."""
+    """The first state as a prior, how it was found, the pass state after that, and initial values."""
 
     prior: PriorBuilder
     method: str

@@ -30,7 +30,7 @@ LONGEST_S = 30.0
 ITERATIONS = 5
 # Acceleration (m/s^2) of a hand-held device beside gravity, and how long (s) it stays alike.
 MOTION, MOTION_S = 1.0, 0.5
-# A heading (rad) less sure than this is none.
+# A heading (rad) with a larger sigma than this is unknown.
 SURE_HEADING = 0.5
 BIAS, IRON, UP, FIELD = (slice(3 * i, 3 * i + 3) for i in range(4))
 
@@ -141,7 +141,7 @@ def field_start(
 
     Parameters
     ----------
-    iron_sigma : uT, how sure the hard iron of `noise` is; declination rad
+    iron_sigma : uT, of the hard iron of `noise`; declination rad
     """
     there = seen(imu, magnetometer, start_ns, noise)
     if there is None:

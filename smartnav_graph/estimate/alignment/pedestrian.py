@@ -1,4 +1,4 @@
-"""The whole way of a walker at first sight: the path of the steps laid on the fixes.
+"""A rough trajectory of a pedestrian: the path of the steps laid on the fixes.
 
     p(t) = p_0 + c S_b(t)        S_b(t) = integral of e^(i (yaw(u) - b u)) dl(u)
 
@@ -33,13 +33,13 @@ from smartnav_graph.smoothers.estimate import values_of
 Complexes = NDArray[np.complex128]
 
 LEVELLING_S = 3.0  # the mean force of so many seconds is up: a walker's pace hardly changes
-SPARSE_S = 2.0  # fixes closer together than this tell the first state by themselves
+SPARSE_S = 2.0  # closer fixes are enough to find the first state
 COARSE_BIASES = 41  # values of b tried within three sigma
 
 
 @dataclass(frozen=True)
 class Walk:
-    """First sight of every keyframe: attitude R (n, 3, 3), position p (n, 3) m, velocity v (n, 3) m/s in nav, gyro_bias
+    """Rough state of every keyframe: attitude R (n, 3, 3), position p (n, 3) m, velocity v (n, 3) m/s in nav, gyro_bias
     (n, 3) rad/s."""
 
     windows: Sequence[Window]
@@ -91,7 +91,7 @@ def walked(
     body_R_vehicle: Floats,
     noise: StepNoise,
 ) -> Walk | None:
-    """The way through `windows`, or None where fewer than two fixes stand apart or nobody walks.
+    """The trajectory through `windows`, or None where all fixes are at one place or there are no steps.
 
     Parameters
     ----------

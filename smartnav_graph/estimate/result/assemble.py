@@ -77,7 +77,7 @@ def to_solution(solved: SolvedProblem) -> Solution:
 
 
 def carried_over(problem: Problem, estimate: Estimate, windows: Sequence[Window]) -> gtsam.Values:
-    """An estimate as gtsam.Values for other windows of the same stretch: states as foretold inside its own windows,
+    """An estimate as gtsam.Values for other windows of the same stretch: states as predicted inside its own windows,
     session states as they are."""
     t_ns = np.array([window.t1_ns for window in windows], dtype=np.int64)
     there = states_at(problem.windows, Kinematics(*estimate.states()), problem.session.gravity, t_ns)
@@ -138,7 +138,7 @@ def _of_stack(stack: StackedFactors, estimate: Estimate) -> Part:
 
 
 def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:
-    """Rows of a replay that have no keyframe of their own, at the time they speak of."""
+    """Rows of a replay that have no keyframe of their own, at their measurement time."""
     stamps = {row.row: row.t_ns for window in problem.windows for row in window.delayed.get(sensor, ())}
     parts: list[Part] = []
     for stack in estimate.stacks(sensor) if stamps else ():

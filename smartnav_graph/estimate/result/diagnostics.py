@@ -151,7 +151,7 @@ def _largest_move(before: tuple[Ints, Floats], now: tuple[Ints, Floats]) -> floa
 
 
 def doubted_rows(update: GraphUpdate) -> int:
-    """Rows of a step that are left out, or stand under Cauchy's loss because they contradict what was foretold."""
+    """Rows of an update that are left out, or have Cauchy's loss because they contradict the prediction."""
     native = sum(_lets_go(factor) for _, factor in update.factors)
     return native + sum(
         len(block.used) if block.loss == "cauchy" else len(block.used) - sum(block.used) for block in update.blocks

@@ -15,7 +15,7 @@ Rejection = Mapping[str, Any]
 
 # Weight below which a redescending loss has left a row out of a run that gates nothing (replay without polish).
 LEFT_OUT = 0.1
-MOST = 10_000  # rejections told one by one
+MOST = 10_000  # rejections listed one by one
 
 
 def rejections(solved: SolvedProblem) -> list[Rejection]:
@@ -30,7 +30,7 @@ def rejections(solved: SolvedProblem) -> list[Rejection]:
 
 def _positions(solved: SolvedProblem) -> list[Rejection]:
     """Fixes that the gate rejected."""
-    told: list[Rejection] = []
+    found: list[Rejection] = []
     problem, estimate = solved.problem, solved.estimate
     for name, residuals in solved.fixes.items():
         stream = getattr(problem.session, name, None)
@@ -39,24 +39,24 @@ def _positions(solved: SolvedProblem) -> list[Rejection]:
         for k in out:
             row = int(residuals.rows[k])
             t_ns = int(estimate.t_ns[residuals.keyframe[k]] if stream is None else stream.t_ns[row])
-            told.append(_entry(problem, t_ns, name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)})
-    return told
+            found.append(_entry(problem, t_ns, name, row, float(sigmas[k])) | {"size_m": round(float(metres[k]), 3)})
+    return found
 
 
 def _rows(problem: Problem, estimate: Estimate) -> list[Rejection]:
     """Rows of blocks that were not used, or that a redescending loss left out."""
-    told: list[Rejection] = []
+    found: list[Rejection] = []
     for sensor in sorted({block.sensor for block in estimate.blocks}):
         for stack in estimate.stacks(sensor):
             size = stack.sizes(estimate.values)
             left_out = ~stack.used
             if stack.loss == "cauchy":
                 left_out |= stack.weight(size[:, None]) < LEFT_OUT
-            told += [
+            found += [
                 _entry(problem, int(stack.t_ns[k]), sensor, int(stack.rows[k]), float(size[k]))
                 for k in np.flatnonzero(left_out)
             ]
-    return told
+    return found
 
 
 def _entry(problem: Problem, t_ns: int, sensor: str, row: int, sigmas: float) -> dict[str, Any]:

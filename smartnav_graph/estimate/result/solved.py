@@ -1,4 +1,4 @@
-"""A problem solved, as everything that tells of it takes it."""
+"""A problem solved: what results are made from."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from smartnav_graph.smoothers.estimate import Estimate
 
 @dataclass(frozen=True)
 class SolvedProblem:
-    """The estimate of a problem and the memory it was made with."""
+    """The estimate of a problem and the pass state it was made with."""
 
     problem: Problem
     estimate: Estimate

@@ -1,4 +1,4 @@
-"""What happened in one run, as summary.json tells it."""
+"""What happened in one run: the content of summary.json."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def peak_memory_mb() -> float:
 
 
 def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
-    """What speaks against the solution."""
+    """Reasons to doubt the solution."""
     doubts = []
     if not absolute:
         doubts.append(
@@ -151,7 +151,7 @@ def _gaps(problem: Problem) -> list[dict[str, Any]]:
 
 
 def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outliers.Account | None) -> dict[str, int]:
-    """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the way, and matches and
+    """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the trajectory, and matches and
     observations of those that do not."""
     found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("image_pairs", "matches")}
     if seen is not None:
@@ -162,7 +162,7 @@ def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outlier
 
 
 def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
-    """The states of the session, and the noise found on the way."""
+    """The states of the session, and the noise found."""
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     found: dict[str, dict[str, Any]] = {}
     for state in estimate.session.values():

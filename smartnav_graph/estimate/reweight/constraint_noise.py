@@ -7,7 +7,7 @@ sigma of one row they weigh too much, with
 
 as much as they should for whatever lasts longer than they hang together (rho_k: autocorrelation of the residuals at lag
 k, up to its first zero). sigma_1 is the variance component sum r^2 / redundancy, held softly at the class default, and
-never below it: where fixes are weak the solution follows a slow slip, and the residuals tell only its quick part.
+never below it: where fixes are weak the solution follows a slow slip, and the residuals show only its fast part.
 
 Source: Koch (1999), Parameter estimation, 3.6; Priestley (1981), Spectral Analysis and Time Series, 5.3.
 """

@@ -1,6 +1,6 @@
 """Which image pairs, and which of their matches, an estimate believes: pass by pass until they are settled.
 
-First by the turn that inertial data tell (two matches give the baseline); then at the smoothed states; then once more,
+First by the rotation of the inertial data (two matches give the baseline); then at the smoothed states; then once more,
 whereupon pairs are compressed. Where too few pairs agree with the solution without images, that is too poor to judge
 them, and none is used.
 """
@@ -37,14 +37,14 @@ from smartnav_graph.vision.pairs import Pairs
 GATE = 4.0
 # Share of the pairs with a baseline that must be kept for any to be used.
 LEAST_PAIRS = 0.5
-# A pair is astray when its second image is less sure than this share of the baseline; pairs that may be.
-LARGEST_STRAY, FEW_ASTRAY = 0.3, 0.1
+# A pair has diverged when the sigma of its second image exceeds this share of the baseline; share of pairs that may.
+LARGEST_SIGMA, FEW_DIVERGED = 0.3, 0.1
 # Sigma of a match beside that of its class: least and most.
 SCALES = (0.3, 3.0)
 
 
 def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
-    """The memory with the matches that agree with an estimate; unchanged once they are settled."""
+    """The pass state with the matches that agree with an estimate; unchanged once they are all tested."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or pass_state.tests(builder.name) >= COMPRESSED:
         return pass_state
@@ -90,10 +90,10 @@ def images_diverged(builders: Iterable[Builder], estimate: Estimate, pass_state:
     poses, inside = relative_poses(builder, selection, estimate)
     sigma = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2)[:, 6:9].max(axis=1))
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
-    strays = sigma[place][builder.seen.images[:, 1]] * builder.seen.length_s
-    diverged = strays > LARGEST_STRAY * np.linalg.norm(poses.t, axis=1)
+    spread = sigma[place][builder.seen.images[:, 1]] * builder.seen.length_s
+    diverged = spread > LARGEST_SIGMA * np.linalg.norm(poses.t, axis=1)
     used = inside & (selection.verdict == IN_USE)
-    return bool(used.any() and diverged[used].mean() > FEW_ASTRAY)
+    return bool(used.any() and diverged[used].mean() > FEW_DIVERGED)
 
 
 def _by_states(
@@ -131,7 +131,7 @@ class Account:
 
 
 def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
-    """The account of the image pairs of a run; None where there are none, or others stand in for them."""
+    """The account of the image pairs of a run; None where there are none, or tracks replace them."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or builder.replaced(pass_state):
         return None
@@ -140,8 +140,8 @@ def account(builders: Iterable[Builder], pass_state: PassState) -> Account | Non
     count = np.bincount(verdict, minlength=len(REASONS))
     inside = verdict[builder.seen.pair] == IN_USE
     use = builder.used_matches(pass_state)
-    told = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    return Account(told, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
+    by_reason = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
+    return Account(by_reason, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
 
 
 def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estimate: Estimate) -> tuple[Relative, Mask]:
@@ -168,5 +168,5 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
         return ""
     return (
         f"image_pairs: refused, only {kept} of {asked} image pairs agree with the solution without images: too "
-        "poor to judge them by; add fixes, control points or standstills"
+        "poor to test them by; add fixes, control points or standstills"
     )

@@ -32,7 +32,7 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.whole_graph import StackedFactors
 
-# Redundancy below which a group teaches nothing.
+# Redundancy below which a group is not estimated.
 LEAST_REDUNDANCY = 4.0
 # Most that a sigma moves in one pass.
 MOST = 5.0

@@ -84,7 +84,7 @@ def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How one sensor's rows stand at the estimate: rows (m,), normalised squares (m,), and the largest square of good
+    """Residuals of one sensor at the estimate: rows (m,), normalised squares (m,), and the largest square of good
     ones by the level of all and a probability; graduated: whether its loss is to be truncated by and by."""
 
     name: str

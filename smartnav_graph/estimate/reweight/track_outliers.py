@@ -34,7 +34,7 @@ from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.vision.points import Cameras, TrackPoints, triangulate
 
-# Passes that judge tracks.
+# Passes that test tracks.
 ROUNDS = 2
 # Share of its observations that a track must keep, and of tracks that must be kept for any to be used.
 LEAST_SHARE = 0.5
@@ -83,7 +83,7 @@ def _tested(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) ->
 
 
 def _without(builder: SmartBuilder, pass_state: PassState) -> PassState:
-    """The memory with image pairs in force again, and the camera's states free."""
+    """The pass state with image pairs in use again, and the camera's states free."""
     names = {state.name for state in builder.camera_model.states().values()}
     return replace(
         pass_state,
@@ -137,7 +137,7 @@ def _refusal(verdict: NDArray[np.intp]) -> str:
     if kept >= LEAST_SHARE * asked and kept:
         return ""
     return (
-        f"smart: refused, only {kept} of {asked} tracks agree with the solution without them: too poor to judge them "
+        f"smart: refused, only {kept} of {asked} tracks agree with the solution without them: too poor to test them "
         "by; leave image_pairs on, or add fixes, control points or standstills"
     )
 
@@ -177,7 +177,7 @@ class Account:
 
     @property
     def contrary(self) -> int:
-        """Tracks that contradict the way."""
+        """Tracks that contradict the trajectory."""
         return self.tracks[REASONS[CONTRARY]]
 
     @property

@@ -1,12 +1,12 @@
-"""What one pass teaches the next: which fixes to reject, and how noisy the sensors are.
+"""What one pass leaves to the next: which fixes to reject, and the noise of the sensors.
 
 Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
-and rows inside the gate are let in again. A redescending loss does not see what lies far beyond its sigma, and the way
-to a fix of centimetres is foretold to metres: so the loss is as wide as that first, and narrowed pass by pass. Where
-asked for, truncated least squares by graduated non-convexity stands
-between the two, warm-started by the first. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
+and rows inside the gate are let in again. A redescending loss ignores what lies far beyond its sigma, and the
+position at a fix of centimetres is predicted to metres: so the loss is as wide as that first, and narrowed pass by
+pass. Where configured, truncated least squares by graduated non-convexity comes between the two, started from the
+first. Noise: the variance component of a group of fixes, sum r^2 / redundancy,
 with the redundancy read from the posterior covariance (Koch 1999, Parameter estimation, 3.6). What needs the
-trajectory found first (time offsets, vehicle constraints, wandering errors) joins when nothing is left to learn
+trajectory found first (time offsets, vehicle constraints, correlated errors) joins when nothing changes
 without it; session states that the data do not determine are held at their calibrated value.
 """
 
@@ -51,7 +51,7 @@ STEADY = 0.1
 STEADY_INERTIAL = 0.1
 
 
-# Growth of the control a pass from a warm start, and the most passes that takes.
+# Growth of mu a pass, and the most passes that takes.
 GROWTH = 4.0
 GRADUATED_PASSES = 14
 
@@ -65,13 +65,13 @@ OBSERVED = 0.7
 def update_pass_state(
     builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, pass_state: PassState
 ) -> tuple[PassState, bool]:
-    """The memory for the next pass, and whether there is nothing more to learn."""
+    """The pass state of the next pass, and whether nothing changed."""
     new, done = _revised(builders, windows, estimate, pass_state)
     if new.stage < LAST_STAGE:
         return new, done
-    judged = check_pairs(builders, estimate, new)
-    judged = check_tracks(builders, estimate, judged) if judged is new else judged
-    return judged, done and judged is new
+    tested = check_pairs(builders, estimate, new)
+    tested = check_tracks(builders, estimate, tested) if tested is new else tested
+    return tested, done and tested is new
 
 
 def _revised(
@@ -83,14 +83,14 @@ def _revised(
     new = pass_state
     for builder, residuals in found.values():
         new = _rescaled(builder, residuals, new)
-    judged = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
-    if pass_state.phase is Phase.PLAIN and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in judged):
+    tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
+    if pass_state.phase is Phase.PLAIN and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested):
         return replace(new, phase=Phase.ROBUST), False
     if pass_state.narrowing:
         return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
-    outliers = {v.name: v.outside() for v in judged}
+    outliers = {v.name: v.outside() for v in tested}
     if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
-        weighed = _graduated(judged, pass_state)
+        weighed = _graduated(tested, pass_state)
         if weighed is not None:
             return replace(weighed, noise_scales=new.noise_scales), False
         return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
@@ -121,9 +121,9 @@ def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals
     return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
 
 
-def _graduated(judged: Sequence[Verdict], pass_state: PassState) -> PassState | None:
-    """The memory with the weights of the next control; None where every weight is settled, or none is asked for."""
-    asked = [v for v in judged if v.graduated]
+def _graduated(tested: Sequence[Verdict], pass_state: PassState) -> PassState | None:
+    """The pass state with the weights of the next mu; None where every weight is 0 or 1, or GNC is not configured."""
+    asked = [v for v in tested if v.graduated]
     if not asked:
         return None
     squares = {v.name: v.relative() for v in asked}
@@ -135,7 +135,7 @@ def _graduated(judged: Sequence[Verdict], pass_state: PassState) -> PassState | 
     if all(gnc.converged(weight) for weight in found.values()):
         return None
     weights = {v.name: dict(zip(v.rows.tolist(), found[v.name].tolist(), strict=True)) for v in asked}
-    rejected = {v.name: v.outside() for v in judged if not v.graduated}
+    rejected = {v.name: v.outside() for v in tested if not v.graduated}
     return replace(pass_state, phase=Phase.GRADUATED, rejected=rejected, weights=weights, gnc_mu=mu)
 
 
@@ -147,18 +147,18 @@ def extra_passes(builders: Iterable[Builder]) -> int:
 
 
 def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
-    """The memory with what joins once the trajectory is found, and without what turned out not to be observable."""
+    """The pass state with what joins once the trajectory is found; session states that are not observable are fixed."""
     positions = position_builders(builders)
-    wandering = frozenset(b.name for b in positions if b.wanders(pass_state))
+    correlated = frozenset(b.name for b in positions if b.wanders(pass_state))
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
-        return replace(pass_state, stage=LAST_STAGE, correlated=wandering) if later else pass_state
+        return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
     blind = {
         state.name: state.prior_mean
         for state in estimate.session.values()
         if not state.held and kind_of(state.key).fixable and (state.sigma > OBSERVED * state.prior_sigma).all()
     }
-    return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=wandering)
+    return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=correlated)
 
 
 def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
@@ -180,8 +180,8 @@ def _inertial(
     level: float,
 ) -> tuple[PassState, bool]:
     """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
-    residuals hold more than noise: what they say is an upper bound. Beside fixes that wander it is a lower one: the
-    solution follows slow errors of the sensor as it follows those of the fixes, and residuals tell the quick part.
+    residuals hold more than noise: what they give is an upper bound. Beside correlated fixes it is a lower one: the
+    solution follows slow errors of the sensor as it follows those of the fixes, and residuals show the fast part.
     Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
     scales = noise_scales(builders, windows, estimate, pass_state, level)
     if any(builder.wanders(pass_state) for builder in position_builders(builders)):
