@@ -1,4 +1,4 @@
-"""The package's door: light, and the names it promises."""
+"""The public names of the package: light to import, and all there."""
 
 import json
 import subprocess

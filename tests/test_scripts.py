@@ -57,7 +57,7 @@ def tool(folder: Path, name: str, code: str) -> None:
     (folder / name).chmod(0o755)
 
 
-def test_an_old_python_is_passed_over_and_its_absence_told(tmp_path):
+def test_an_old_python_is_passed_over_and_its_absence_reported(tmp_path):
     tool(tmp_path, "dirname", 'exec /usr/bin/dirname "$@"')
     tool(tmp_path, "python3.12", "exit 127")  # a shim without a version behind it
     tool(tmp_path, "python3", "exit 1")  # too old
@@ -72,27 +72,27 @@ def test_a_benchmark_measures_a_fresh_process(tmp_path):
     sn.save(sn.simulate("figure-eight-60s"), tmp_path / "eight")
     command = [sys.executable, ROOT / "scripts" / "benchmark.py", "--measure", "replay", tmp_path / "eight"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    told = json.loads(done.stdout)
-    assert set(told) == {"seconds", "peak_memory_mb", "detail"}
-    assert told["detail"]["keyframes"] == 62 and told["peak_memory_mb"] > 50
-    assert told["seconds"] == pytest.approx(told["detail"]["update_ms"]["p99"] / 1e3)
+    result = json.loads(done.stdout)
+    assert set(result) == {"seconds", "peak_memory_mb", "detail"}
+    assert result["detail"]["keyframes"] == 62 and result["peak_memory_mb"] > 50
+    assert result["seconds"] == pytest.approx(result["detail"]["update_ms"]["p99"] / 1e3)
 
 
 def test_the_baseline_runs():
     command = [sys.executable, ROOT / "scripts" / "bare_gtsam.py", "2", "imu"]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    assert set(told["cpu_s"]) == {"preintegrate", "build", "solve", "covariance"} and told["rms_m"] < 10.0
+    result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert set(result["cpu_s"]) == {"preintegrate", "build", "solve", "covariance"} and result["rms_m"] < 10.0
 
 
 def test_the_front_end_is_measured_beside_bare_opencv(tmp_path):
-    def told(*arguments: object) -> dict[str, float]:
+    def measured(*arguments: object) -> dict[str, float]:
         command = [sys.executable, *map(str, arguments)]
         return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
     scripts, folder = ROOT / "scripts", tmp_path / "pictures"
     subprocess.run([sys.executable, scripts / "bare_front_end.py", "make", folder, "4"], check=True)
-    ours = told(scripts / "benchmark.py", "--measure", "front-end", folder)["detail"]
-    bare = told(scripts / "bare_front_end.py", folder)
+    ours = measured(scripts / "benchmark.py", "--measure", "front-end", folder)["detail"]
+    bare = measured(scripts / "bare_front_end.py", folder)
     assert ours["pairs"] == bare["pairs"] == 3
     assert ours["matches"] > 1500 and bare["matches"] > 1500  # of 3 x 1500 points
 
