@@ -173,3 +173,12 @@ def test_wrong_options_and_a_reference_without_an_origin():
     )
     with pytest.raises(ConfigError, match=r"reference_hpa = 1013\.25 in a session without origin"):
         sn.smooth(local, replace(Config(), barometer=BarometerConfig(reference_hpa=1013.25)))
+
+
+def test_the_bias_walks_with_the_root_of_the_time():
+    sigmas = []
+    for length in (0.25, 1.0, 4.0):
+        update = step_of(builder(T_NS, np.zeros(100)), window(1.0, 1.0 + length))
+        (walk,) = (factor for tag, factor in update.factors if tag.sensor == "barometer_bias")
+        sigmas.append(walk.noiseModel().sigmas()[0])
+    assert sigmas == pytest.approx([0.5 * 8.4 * 0.003, 8.4 * 0.003, 2.0 * 8.4 * 0.003])

@@ -101,6 +101,22 @@ def test_a_false_rest_lets_go():
     assert near == pytest.approx(0.5 * (0.05 / 0.02) ** 2, rel=0.05)  # and all of it at 0.05 m/s
 
 
+def test_a_speed_that_is_merely_unknown_does_not_let_go():
+    # after a minute of dead reckoning the speed is known to 2 m/s: 3 m/s is no contradiction of a rest
+    window = Window(1, NS, 2 * NS, "static", np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    covariance = np.zeros((15, 15))
+    covariance[6:9, 6:9] = np.eye(3) * 2.0**2 / 3.0
+    errors = []
+    for previous in (at(1.0), replace(at(1.0), covariance=covariance)):
+        update = GraphUpdate(1, window.t1_ns, 2.0)
+        StandstillBuilder(rests()).add(update, window, previous, PassState())
+        ((_, factor), *_) = update.factors
+        errors.append(factor.error(values(speed=(3.0, 0.0, 0.0))))
+    least_squares = 0.5 * (3.0 / 0.02) ** 2
+    assert errors[0] < 0.02 * least_squares  # a speed that is known contradicts, and lets go
+    assert errors[1] > 0.8 * least_squares
+
+
 def test_a_false_stance_pulls_with_constant_force_only():
     (_, factor), *_ = step_of(StandstillBuilder(rests(on_foot=True)), 1.0, 2.0).factors
     costs = [factor.error(values(speed=(v, 0.0, 0.0))) for v in (10.0, 20.0, 30.0)]
