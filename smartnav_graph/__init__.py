@@ -1,4 +1,4 @@
-"""smartnav_graph: a recorded phone or MEMS session in, a smoothed trajectory with honest covariance out.
+"""smartnav_graph: smoothed trajectories with covariance from recorded phone or MEMS sessions.
 
     import smartnav_graph as sn
 
@@ -13,23 +13,23 @@ Conventions
 -----------
 **Frames.** *nav* is the local tangent plane, x east, y north, z up (ENU), at the session's origin (WGS84 latitude and
 longitude in degrees, ellipsoidal height in metres); a session without origin is metric and local. *body* is the IMU's
-own axes, never turned: a phone has x right, y top, z out of the screen. Which body axis points forward and up stands in
-the session (``device.forward``, ``device.up``; a phone lying flat ``+y``, ``+z``) and serves heading, pitch and roll.
+own axes, never rotated: a phone has x right, y top, z out of the screen. The session says which body axes point forward
+and up (``device.forward``, ``device.up``; a phone lying flat ``+y``, ``+z``), for heading, pitch and roll.
 *cam* is OpenCV's optical frame: x right, y down, z forward.
 
 **Names.** ``a_X_b`` is X of b expressed in a, so that neighbouring indices cancel: ``nav_T_cam = nav_T_body *
-body_T_cam``; ``nav_R_body`` turns body coordinates into nav, ``body_t_antenna`` is a lever arm in body axes.
+body_T_cam``; ``nav_R_body`` rotates body coordinates into nav, ``body_t_antenna`` is a lever arm in body axes.
 
 **Accelerometers** measure specific force: at rest +9.81 m/s^2 on the axis that points up. Gravity is normal gravity at
-the origin where there is one, unless the session gives its own value.
+the origin, unless the session has its own value.
 
 **Time** is ``t_ns``, int64 nanoseconds of the source's own clock, one clock a session; seconds in options, reports and
 `Solution.seconds` count from time zero, the first inertial sample.
 
-**Units** are SI and radians; a suffix tells where not (``_deg``, ``_ns``, ``_hpa``, ``_ut``, ``_px``). Noise densities
+**Units** are SI and radians; a suffix marks exceptions (``_deg``, ``_ns``, ``_hpa``, ``_ut``, ``_px``). Noise densities
 are in unit/sqrt(Hz), random walks in unit*sqrt(Hz) per second.
 
-**Angles for people.** Heading is clockwise from north, pitch positive with the forward axis up, roll positive with the
+**Angles.** Heading is clockwise from north, pitch positive with the forward axis up, roll positive with the
 right side down; degrees.
 
 **Covariance** is 15 x 15 in the order rotation, position, velocity (nav axes), accelerometer bias, gyroscope bias (body
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from smartnav_graph.session.session import Session as Session
     from smartnav_graph.simulation.scenarios import simulate as simulate
 
-# name -> module that holds it; imported when first asked for, so that the door itself costs nothing
-_ROOMS = {
+# name -> its module, imported at first use, so that the package itself loads fast
+_MODULES = {
     "Calibration": "session.calibration.model",
     "Config": "estimate.config",
     "Run": "estimate.run",
@@ -78,17 +78,17 @@ _ROOMS = {
 }
 
 __all__ = [
-    *_ROOMS,
+    *_MODULES,
     "replay",
     "run",
     "smooth",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _ROOMS:
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_ROOMS[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
@@ -96,32 +96,32 @@ def __dir__() -> list[str]:
 
 
 def smooth(session: Session, config: Config | None = None, **options: Any) -> Solution:
-    """The smoothed solution of a recorded session: every state with its covariance from all data.
+    """The smoothed solution of a recorded session: all states with covariance, from all data.
 
     Parameters
     ----------
     session : of `load` or `simulate`
     config : all options; the defaults suit phones and MEMS loggers
-    options : fields of `smartnav_graph.estimate.config.RunConfig` over it: vehicle, sensors, withhold,
+    options : fields of `smartnav_graph.estimate.config.RunConfig` that override it: vehicle, sensors, withhold,
         start_s, end_s, initial, rate, passes
 
     Raises
     ------
     SmartnavError
-        Bad input, or a problem that cannot be solved; the message says what to do.
+        Invalid input, or a problem that cannot be solved; the message says what to do.
     """
     return run(session, config, **options).solution
 
 
 def replay(session: Session, config: Config | None = None, **options: Any) -> Solution:
-    """The causal solution: every keyframe as it was known when its data had come in. Otherwise as `smooth`."""
+    """The causal solution: every keyframe from the data available at its time. Otherwise as `smooth`."""
     causal = run(session, config, causal=True, **options).causal
-    assert causal is not None  # a replay gives one
+    assert causal is not None  # of a replay
     return causal
 
 
 def run(session: Session, config: Config | None = None, *, causal: bool = False, **options: Any) -> Run:
-    """Everything one run gives: solution, summary, withheld rows scored, and of a replay (`causal`) both solutions.
+    """All results of a run: solution, summary, errors at withheld measurements; of a replay (`causal`) both solutions.
 
     Parameters and errors as `smooth`.
     """

@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 # name -> module, class, one line. Modules are imported when their command is called.
 COMMANDS: dict[str, tuple[str, str, str]] = {
-    "demo": ("demo", "Demo", "smooth, evaluate and draw the two recordings that come with gtsam"),
-    "formats": ("sessions", "Formats", "the readers, and how a file is recognised"),
-    "import": ("sessions", "Import", "a foreign log -> a session folder"),
-    "info": ("sessions", "Info", "what a session holds, what is missing, what looks wrong"),
-    "simulate": ("sessions", "Simulate", "a named simulated session with its truth"),
-    "degrade": ("sessions", "DegradeSession", "a session -> a noisier, faulty one"),
-    "match": ("match", "Match", "the pictures of a session -> matched points or tracks; or how good features are"),
-    "smooth": ("runs", "Smooth", "a session -> a run: the smoothed trajectory with its covariance"),
-    "replay": ("runs", "Replay", "the same one window at a time, causal"),
-    "evaluate": ("scores", "Evaluate", "a run against a reference"),
-    "intervals": ("intervals", "Intervals", "how far a solution strays between fixes"),
-    "explain": ("inspection", "Explain", "what determined the state of a run at one instant"),
-    "compare": ("inspection", "Compare", "a run against another run"),
-    "export": ("runs", "Export", "a run as TUM, KML, GeoJSON, GPX or CSV"),
-    "view": ("sessions", "View", "sessions and runs in the Rerun viewer"),
+    "demo": ("demo", "Demo", "process the two recordings of the gtsam package, with report and recording"),
+    "formats": ("sessions", "Formats", "list the formats that can be imported, and how they are recognised"),
+    "import": ("sessions", "Import", "import a log of another program into a session folder"),
+    "info": ("sessions", "Info", "check a session: streams, rates, data gaps, clock, units"),
+    "simulate": ("sessions", "Simulate", "simulate a session with its ground truth"),
+    "degrade": ("sessions", "DegradeSession", "add noise and faults to a session"),
+    "match": ("match", "Match", "match or track points in the images of a session; compare features"),
+    "smooth": ("runs", "Smooth", "compute the trajectory of a session (batch smoothing)"),
+    "replay": ("runs", "Replay", "compute the causal trajectory of a session, one window at a time"),
+    "evaluate": ("scores", "Evaluate", "compare a run with a reference trajectory"),
+    "intervals": ("intervals", "Intervals", "drift between fixes (simulated outages)"),
+    "explain": ("inspection", "Explain", "explain which measurements determine the state of a run at one epoch"),
+    "compare": ("inspection", "Compare", "compare a run with another run"),
+    "export": ("runs", "Export", "export a run as TUM, KML, GeoJSON, GPX or CSV, or its images with EXIF"),
+    "view": ("sessions", "View", "show sessions and runs in the Rerun viewer"),
 }
 
 
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
         return code
-    except BrokenPipeError:  # the reader of our output (head, less) has left
+    except BrokenPipeError:  # the reader of the output (head, less) was closed
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
@@ -105,13 +105,13 @@ def _run(name: str, rest: list[str]) -> int:
     except KeyboardInterrupt:
         print("smartnav: interrupted; nothing was written", file=sys.stderr)
         return 130
-    except SystemExit as exit:  # help was asked for, or the arguments are wrong
+    except SystemExit as exit:  # --help, or wrong arguments
         return exit.code if isinstance(exit.code, int) else 2
 
 
 @contextmanager
 def _interrupt_ends_process() -> Iterator[None]:
-    """Ctrl-C while compiled libraries load would come out of them as an ImportError: let it end the process instead."""
+    """End the process on Ctrl-C while compiled libraries load: they would raise an ImportError instead."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""The first command: two recordings that come with gtsam, from the log to the picture."""
+"""The first command: the two recordings of the gtsam package, from the log to the report."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ KEPT = "gnss:every=10"
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Command):
-    """Smooth the two recordings that come with gtsam, the KITTI drive and half a minute of EuRoC, and write their
-    reports and recordings; needs no data of your own. May be run again: it replaces what it wrote.
+    """Smooth the two recordings of the gtsam package, the KITTI drive and half a minute of EuRoC, and write reports and
+    recordings. No data of your own are needed. A second run replaces the first.
 
     Example: smartnav demo --out demo
     """
@@ -36,15 +36,15 @@ class Demo(Command):
         session = write_over(readers.read("gtsam-kitti"), self.out / "kitti")
         print(f"KITTI drive: {len(session.require_imu())} inertial samples")
         self._smooth(session, Config(), self.out / "kitti-run")
-        print(f"\nThe same with one fix in ten ({KEPT}); the other nine are only scored:")
+        print(f"\nThe same with one fix in ten ({KEPT}); the other nine are compared with the result:")
         kept = replace(Config(), run=RunConfig(withhold=(KEPT,)))
         self._smooth(session, kept, self.out / "kitti-withheld", brief=True)
         euroc = write_over(readers.read("gtsam-euroc"), self.out / "euroc")
-        print("\nEuRoC half minute: no position at all, a camera that starts from a standstill:")
+        print("\nEuRoC, half a minute: no positions, a camera that starts from a standstill:")
         self._smooth(euroc, Config(), self.out / "euroc-run")
         print(f"\nopen {self.out / 'kitti-run' / 'report.html'} in a browser")
-        print(f"see  smartnav view {self.out / 'kitti-run'} [--web]")
-        print(f"see  smartnav view {self.out / 'euroc-run'} [--web]")
+        print(f"or in the viewer: smartnav view {self.out / 'kitti-run'} [--web]")
+        print(f"                  smartnav view {self.out / 'euroc-run'} [--web]")
 
     def _smooth(self, session: Session, config: Config, out: Path, *, brief: bool = False) -> None:
         with progress(self.quiet) as show:
@@ -54,17 +54,19 @@ class Demo(Command):
 
 
 def claim(out: Path) -> None:
-    """Make the folder, or take one that an earlier demo made."""
+    """Create the folder, or use one of an earlier demo."""
     if out.exists() and not (out / MARK).is_file() and not (out.is_dir() and not any(out.iterdir())):
-        raise SessionError(out, "exists already and is no demo", "a new name", "choose another --out")
+        raise SessionError(out, "exists already and is not of the demo", "a new name", "choose another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / MARK).write_text("written by smartnav demo, which may replace what stands here\n", encoding="utf-8")
+        (out / MARK).write_text(
+            "written by smartnav demo, which may replace the files in this folder\n", encoding="utf-8"
+        )
     except OSError as error:
-        raise SessionError(out, f"cannot be written ({error.strerror})", "a writable place") from error
+        raise SessionError(out, f"cannot be written ({error.strerror})", "a writable folder") from error
 
 
 def write_over(session: Session, path: Path) -> Session:
-    """Write a session folder over an older one."""
+    """Write a session folder, replacing an older one."""
     session_folder.save(session, path, force=True)
     return session.replace(path=path)

@@ -1,8 +1,7 @@
-"""Commands that look into runs: what determined a state, and how two runs differ."""
+"""Commands that inspect runs: explain a state, compare two runs."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,14 +10,15 @@ import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
 from smartnav_graph.cli.progress import progress
+from smartnav_graph.cli.text import print_json
 from smartnav_graph.core.files import refuse_existing
-from smartnav_graph.output.run_folder import plain, read_run
+from smartnav_graph.output.run_folder import read_run
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explain(Command):
-    """What determined the state at one instant: whose uncertainty it has, what pulls at it, what it rests on, and the
-    nearest gap, rejection and standstill.
+    """Explain which measurements determine the state at one epoch: variance by source, what is not observable without
+    a source, shift of the estimate by source, and the nearest data gap, rejection and standstill.
 
     Example: smartnav explain kitti-run --at 306
     """
@@ -26,7 +26,7 @@ class Explain(Command):
     run_path: RunPath
     """Run folder."""
     at: Annotated[float | None, tyro.conf.arg(metavar="T")] = None
-    """The instant, seconds from the session's start; by default where the position is least certain."""
+    """Time in seconds from the session's start; by default that of the largest position uncertainty."""
     json: Switch = False
     """Print JSON, and nothing else, on stdout."""
 
@@ -34,15 +34,18 @@ class Explain(Command):
         from smartnav_graph.output.explain import explain
 
         with progress(self.quiet) as show:
-            show(f"looking into {self.run_path}", 0, 0)
+            show(f"reading {self.run_path}", 0, 0)
             found = explain(read_run(self.run_path), self.at)
-        print(json.dumps(plain(found.to_dict()), allow_nan=False) if self.json else found.to_text())
+        if self.json:
+            print_json(found.to_dict())
+        else:
+            print(found.to_text())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(Command):
-    """A run against another: how far apart they are and where, how their sigmas differ, what was asked of each, what
-    each rejected, and the figures that differ; as a table, and with --out as one recording for the Rerun viewer.
+    """Compare a run with another run: differences of states and sigmas, options, rejected measurements and summary
+    figures; as a table, and with --out as one recording for the Rerun viewer.
 
     Example: smartnav compare kitti-run kitti-replay --out both.rrd
     """
@@ -52,7 +55,7 @@ class Compare(Command):
     second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN2")]
     """Run folder."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write both as one recording (.rrd): both paths, their differences along time."""
+    """Also write one recording (.rrd): both paths, and their differences over time."""
     force: Switch = False
     """Replace the file."""
     json: Switch = False
@@ -70,7 +73,7 @@ class Compare(Command):
                 show("writing the recording", 0, 0)
                 found.write_recording(self.out, force=self.force)
         if self.json:
-            print(json.dumps(plain(found.to_dict()), allow_nan=False))
+            print_json(found.to_dict())
             return
         print(found.to_text())
         if self.out is not None:

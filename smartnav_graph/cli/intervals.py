@@ -1,8 +1,7 @@
-"""Drift between fixes (simulated outages), on the command line."""
+"""The command for the drift between fixes."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,38 +11,38 @@ import numpy as np
 import tyro
 
 from smartnav_graph import readers
-from smartnav_graph.cli.options import Asking, Switch, repairs
+from smartnav_graph.cli.options import SessionCommand, Switch, repairs
 from smartnav_graph.cli.progress import progress
+from smartnav_graph.cli.text import print_json
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.evaluation.intervals import FixesFromReference, Interval, intervals
-from smartnav_graph.output.run_folder import plain
 from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Reference
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intervals(Asking):
-    """Drift between fixes (simulated outages): replays the session with fixes every few seconds, and compares the
-    smoothed and the predicted positions between them with a reference: mean, 67 %, 95 % and RMS of the error.
+class Intervals(SessionCommand):
+    """Drift between fixes (simulated outages): replay the session with a fix every few seconds, and compare the
+    trajectory between the fixes with a reference: mean, 67 %, 95 % and RMS of the error.
 
-    smoothed: all data; causal: real-time estimate; causal_end: prediction before the next fix.
+    smoothed: all data; causal: past data only; causal_end: prediction before the next fix.
 
     Example: smartnav intervals walk --every 1,2,5 --reference walk --fixes-from-reference --fix-sigma 0.005,0.5
     """
 
     every: Annotated[str, tyro.conf.arg(metavar="S,S,...")]
-    """Spacings of the fixes, seconds."""
+    """Intervals between fixes, seconds."""
     reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """TUM, EuRoC ground truth, CSV with t, x, y, z named, or a session folder."""
     fixes_from_reference: Switch = False
-    """Generate the fixes from the reference, with noise, instead of thinning the session's own."""
+    """Generate the fixes from the reference, with noise, instead of using the session's own."""
     fix_sigma: Annotated[str, tyro.conf.arg(metavar="M[,DEG]")] = "0.3,2"
-    """Sigma of these fixes on each axis: position m, attitude deg (without it they have no attitude)."""
+    """Sigma of these fixes on each axis: position m, attitude deg (one number: no attitude)."""
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.0
-    """Latency of these fixes: how long after their time of measurement they become available."""
+    """Delay of these fixes, seconds (delayed measurements)."""
     seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """How many sets of these fixes, seeds 0 to N - 1."""
+    """Number of noise realisations, seeds 0 to N - 1."""
     json: Switch = False
     """Print JSON, and nothing else, on stdout."""
 
@@ -57,16 +56,19 @@ class Intervals(Asking):
                 session, reference, every, generated=generated, seeds=self.seeds, config=config, progress=show
             )
             found = list(rows)
-        print(json.dumps(plain([r.to_dict() for r in found]), allow_nan=False) if self.json else intervals_text(found))
+        if self.json:
+            print_json([row.to_dict() for row in found])
+        else:
+            print(intervals_text(found))
 
     def _reference(self, session: Session) -> Reference:
-        """The reference; where it is the log just read, what came with that."""
+        """The reference; that of the session where both are the same log."""
         folder = Path(self.session)
         if self.reference != folder or (folder / "reference.parquet").is_file():
             return load_reference(self.reference)
         if session.reference is None:
             raise SessionError(
-                self.reference, "holds no reference", "a log with one, or a file", "give --reference FILE"
+                self.reference, "contains no reference", "a log with one, or a file", "give --reference FILE"
             )
         return session.reference
 
@@ -85,7 +87,7 @@ def numbers(option: str, text: str) -> list[float]:
     Raises
     ------
     ConfigError
-        Not one number at least, or something else among them.
+        The text is empty or contains something else.
     """
     try:
         found = [float(part) for part in text.split(",")]
@@ -97,7 +99,7 @@ def numbers(option: str, text: str) -> list[float]:
 
 
 def intervals_text(found: Sequence[Interval]) -> str:
-    """A table for people: one line a spacing and kind, figures averaged over the seeds."""
+    """A table: one line for each interval and kind, figures averaged over the seeds."""
     names = ("mean_m", "p67_m", "p95_m", "rmse_m", "horizontal_mean_m")
     heading = "".join(f"{name:>10}" for name in ("mean m", "67 % m", "95 % m", "RMS m", "mean 2-D"))
     lines = [f"{'every s':>8} {'kind':<11}{'seeds':>6}{'rows':>8}{heading}"]
@@ -106,6 +108,6 @@ def intervals_text(found: Sequence[Interval]) -> str:
         groups.setdefault((row.every_s, row.kind), []).append(row)
     for (every, kind), rows in groups.items():
         figures = [float(np.mean([getattr(row, name) for row in rows])) for name in names]
-        told = "".join(f"{value:>10.4f}" for value in figures)
-        lines.append(f"{every:>8g} {kind:<11}{len(rows):>6}{sum(row.n for row in rows):>8}{told}")
+        cells = "".join(f"{value:>10.4f}" for value in figures)
+        lines.append(f"{every:>8g} {kind:<11}{len(rows):>6}{sum(row.n for row in rows):>8}{cells}")
     return "\n".join(lines)

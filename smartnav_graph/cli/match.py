@@ -1,12 +1,11 @@
-"""Matched points of pictures on the command line."""
+"""The command that matches points in images."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -14,8 +13,9 @@ import tyro
 from smartnav_graph import readers
 from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names
 from smartnav_graph.cli.progress import progress
+from smartnav_graph.cli.text import print_json
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
-from smartnav_graph.output.run_folder import plain, read_run
+from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.camera import Camera
@@ -32,12 +32,12 @@ FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 
 @dataclass(frozen=True, kw_only=True)
 class Match(Command):
-    """Matched points, or tracks, of a session's pictures; they are kept in the session, and read again by a second
-    call with the same options.
+    """Match points in the images of a session, or track them; the result is stored in the session, and a second call
+    with the same options reads it again.
 
-    With --benchmark nothing is written: matches are compared with the poses that the session's reference tells, or that
-    of --reference. With --map the session gets pose fixes instead: of its pictures in a COLMAP model, whose scale and
-    frame are found from positions that are known without it.
+    With --benchmark nothing is written: matches are compared with the poses of the session's reference, or of
+    --reference. With --map the session gets pose fixes instead: those of its images in a COLMAP model, whose scale and
+    frame are estimated from known positions.
 
     Example: smartnav match lund --features sift
     """
@@ -48,34 +48,34 @@ class Match(Command):
     """orb (default), sift, akaze, brisk, fast+freak, star+brief, gftt+freak, mser+freak, or klt for tracks; with
     --benchmark several, separated by commas, all that the installed OpenCV has by default."""
     policy: Literal["ratio", "thesis"] = "ratio"
-    """Which neighbours match: mutual and by Lowe's ratio, or the 15 best as in the thesis of 2012."""
+    """Matching rule: mutual nearest neighbours with Lowe's ratio test, or the 15 best as in the thesis of 2012."""
     count: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Points of a picture at most; 0 is 1500, or 300 tracks."""
+    """Most points in an image; 0 is 1500, or 300 tracks."""
     spans: Annotated[Text, tyro.conf.arg(metavar="N,N,...")] = None
-    """Pictures between the two of a pair; by default 1,2,4,8, with --benchmark 1."""
+    """Distances between the two images of a pair, in images; by default 1,2,4,8, with --benchmark 1."""
     longest: Annotated[float, tyro.conf.arg(metavar="S")] = 2.0
-    """Longest time between the two of a pair that are not neighbours."""
+    """Longest time between the images of a pair that are not consecutive, seconds."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Pictures a second at most, 0 for all; by default 4, for tracks and with --benchmark all."""
+    """Most images per second, 0 for all; by default 4, for tracks and with --benchmark all."""
     benchmark: Switch = False
-    """True matches, useful pairs and times, beside those of the thesis."""
+    """Print correct matches, useful pairs and times, with those of the thesis."""
     reference: FilePath = None
-    """For --benchmark: true poses beside the session, as `smartnav evaluate` takes them."""
+    """For --benchmark: true poses, in a format of `smartnav evaluate`."""
     from_file: FilePath = None
-    """Take the matches of this match file of 2012 instead of finding some."""
+    """Read matches from a match file of 2012 instead of computing them."""
     to_file: FilePath = None
-    """Write the session's matches as a match file of 2012 instead of finding some."""
+    """Write the session's matches as a match file of 2012 instead of computing them."""
     map: Annotated[Path | None, tyro.conf.arg(metavar="MODEL")] = None
-    """Take pose fixes from this COLMAP model (the folder with cameras, images, points3D) in which pictures of the
-    session are registered under their names, as in `smartnav match walk --map sparse/0 --known walk-run`."""
+    """Make pose fixes from this COLMAP model (the folder with cameras, images, points3D) in which images of the session
+    are registered by file name, as in `smartnav match walk --map sparse/0 --known walk-run`."""
     known: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The run that tells where the pictures of the model were taken, to lay it on; by default the GNSS fixes."""
+    """The run whose positions align the model; by default the GNSS fixes."""
     camera: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
-    """The camera that a match file speaks of, where the session has several."""
+    """The camera of a match file, if the session has several."""
     workers: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Pictures at once; 0 for as many as there are processors."""
+    """Number of parallel processes; 0 for one on each processor."""
     force: Switch = False
-    """Replace what is there."""
+    """Replace an older result."""
     json: Switch = False
     """Print JSON, and nothing else, on stdout."""
 
@@ -85,9 +85,9 @@ class Match(Command):
         if len(given) > 1:
             raise ConfigError(given[1], f"is given with {given[0]}", "one of them", "call twice")
         if self.known is not None and self.map is None:
-            raise ConfigError("--known", "is given without --map", "a model to lay on the run", "add --map MODEL")
+            raise ConfigError("--known", "is given without --map", "a model to align", "add --map MODEL")
         if self.reference is not None and not self.benchmark:
-            raise ConfigError("--reference", "is given without --benchmark", "something to compare", "add --benchmark")
+            raise ConfigError("--reference", "is given without --benchmark", "a comparison", "add --benchmark")
         if self.benchmark:
             self._benchmark()
         elif self.map is not None:
@@ -104,11 +104,11 @@ class Match(Command):
         with progress(self.quiet) as show:
             found = match_store.match(self.session, config, force=self.force, workers=self.workers, progress=show)
         if self.json:
-            self._print_json({"computed": found.computed} | asdict(found.report))
+            print_json({"computed": found.computed} | asdict(found.report))
             return
         print(found.report.to_text())
         name = "tracks" if config.tracks else "matches"
-        print(f"{name}: {Path(self.session) / name}.parquet{'' if found.computed else ', kept from before'}")
+        print(f"{name}: {Path(self.session) / name}.parquet{'' if found.computed else ', read from an earlier call'}")
 
     def _benchmark(self) -> None:
         asked = names(self.features) or tuple(kinds.available())
@@ -119,7 +119,7 @@ class Match(Command):
         with progress(self.quiet) as show:
             found = scores.compare_features(session, asked, config, workers=self.workers, progress=show)
         if self.json:
-            self._print_json([one.to_dict() for one in found])
+            print_json([one.to_dict() for one in found])
         else:
             print_scores(found, all_known=self.features is None)
 
@@ -134,7 +134,7 @@ class Match(Command):
         report = {"from_file": str(path), "rows": len(rows.t0_ns), "matches": len(matches), "rows_without_images": lost}
         match_store.store(folder, matches, {"from_file": path.name, "camera": name}, report)
         if self.json:
-            self._print_json(report)
+            print_json(report)
             return
         print(f"{path}: {len(rows.t0_ns)} rows, {len(matches)} matches, {lost} rows without two images")
         print(f"matches: {folder / 'matches.parquet'}")
@@ -148,7 +148,7 @@ class Match(Command):
         matches = session.matches.take(match_file.of_images(session.matches, mine))
         match_file.write_match_file(matches, path, camera, force=self.force)
         if self.json:
-            self._print_json({"to_file": str(path), "matches": len(matches)})
+            print_json({"to_file": str(path), "matches": len(matches)})
         else:
             print(f"{path}: {len(matches)} matches of {name}")
 
@@ -159,13 +159,13 @@ class Match(Command):
         refuse_foreign_fixes(folder, session)
         known = own_fixes(session) if self.known is None else self._known(self.known, session)
         found = map_pose_fixes(path, session, known)
-        told = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": found.similarity.sigma}
-        told["turn_sigma_deg"] = float(np.degrees(found.similarity.rotation_sigma).max())
-        match_store.store(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, plain(told))
+        report = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": float(found.similarity.sigma)}
+        report["turn_sigma_deg"] = float(np.degrees(found.similarity.rotation_sigma).max())
+        match_store.store(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, report)
         if self.json:
-            self._print_json(told)
+            print_json(report)
             return
-        print(map_text(path, told))
+        print(map_text(path, report))
         print(f"pose fixes: {folder / 'pose_fixes.parquet'}")
 
     @staticmethod
@@ -178,15 +178,15 @@ class Match(Command):
         return KnownPositions(run.solution.t_ns, run.solution.nav_t_body)
 
     def _one_camera(self, session: Session) -> tuple[str, Camera]:
-        """The camera named, or the only one that took images."""
+        """The given camera, or the only one with images."""
         there = [] if session.images is None else sorted(set(session.images.camera))
         cameras = {} if session.calibration is None else session.calibration.cameras
         name = self.camera or (there[0] if len(there) == 1 else "")
         if name not in there:
-            raise ConfigError("--camera", repr(name), f"one that took images: {', '.join(there) or 'there is none'}")
+            raise ConfigError("--camera", repr(name), f"one with images: {', '.join(there) or 'there is none'}")
         if name not in cameras:
             where = Path(self.session) / "calibration.toml"
-            raise CalibrationError(where, f"knows no camera {name}", f"[cameras.{name}]", "add fx, fy, cx, cy")
+            raise CalibrationError(where, f"has no camera {name}", f"[cameras.{name}]", "add fx, fy, cx, cy")
         return name, cameras[name]
 
     def _config(self, features: str, spans: str, rate_hz: float | None) -> FrontEndConfig:
@@ -197,39 +197,36 @@ class Match(Command):
             raise ConfigError("--spans", repr(text), "whole numbers separated by commas, as 1,2,4") from error
         return FrontEndConfig(features, self.policy, self.count, numbers, self.longest, rate_hz)
 
-    def _print_json(self, value: Any) -> None:
-        print(json.dumps(plain(value), allow_nan=False))
-
 
 def refuse_foreign_fixes(folder: Path, session: Session) -> None:
-    """Raise where the session's pose fixes are not those of a model, which may be made again."""
+    """Raise where the session has pose fixes of another source than a model, which --force would lose."""
     fixes = session.pose_fixes
-    sources = set() if fixes is None else {"nobody"} if fixes.source is None else set(fixes.source)
+    sources = set() if fixes is None else {"unknown source"} if fixes.source is None else set(fixes.source)
     if sources - {SOURCE}:
-        found = f"holds pose fixes of {', '.join(sorted(map(str, sources - {SOURCE})))}, which --force would lose"
+        found = f"contains pose fixes of {', '.join(sorted(map(str, sources - {SOURCE})))}, which --force would lose"
         raise SessionError(
             folder / "pose_fixes.parquet", found, "none, or those of a model", "use a copy of the session"
         )
 
 
-def map_text(path: Path, told: Mapping[str, Any]) -> str:
-    """What became of a model's images, and how well it fits, for people."""
+def map_text(path: Path, report: Mapping[str, object]) -> str:
+    """The images of a model and the quality of its alignment, as text."""
     return (
-        f"{path}: {told['used']} images are the session's, {told['aligned']} of them with a known position; "
-        f"{told['unknown']} are not, {told['unregistered']} have no pose\n"
-        f"a unit of the model is {told['metres_a_unit']:.5g} m; it fits the known positions to {told['sigma_m']:.3g} m "
-        f"a coordinate, its axes to {told['turn_sigma_deg']:.2g} deg"
+        f"{path}: {report['used']} images of the session, {report['aligned']} of them with a known position; "
+        f"{report['unknown']} other images, {report['unregistered']} without pose\n"
+        f"one unit of the model is {report['metres_a_unit']:.5g} m; residuals of the known positions "
+        f"{report['sigma_m']:.3g} m in each coordinate, sigma of the axes {report['turn_sigma_deg']:.2g} deg"
     )
 
 
 def print_scores(found: Sequence[Score], *, all_known: bool) -> None:
-    """A table for people: ours, and what the thesis published; kinds that this build lacks only with the latter."""
+    """A table of our figures and those of the thesis; features that OpenCV lacks have only the latter."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=f"policy {found[0].policy}, {found[0].pairs} pairs", title_justify="left")
     table.add_column("features")
-    for heading in ("true", ">= 5 true", "matches", "ms a picture", "ms a pair", "thesis true", ">= 5 true", "s"):
+    for heading in ("true", ">= 5 true", "matches", "ms / image", "ms / pair", "thesis true", ">= 5 true", "s"):
         table.add_column(heading, justify="right")
     for one in found:
         ours = (f"{one.true_rate:.2%}", f"{one.useful_pairs:.2%}", f"{one.median_matches:g}")
@@ -239,15 +236,15 @@ def print_scores(found: Sequence[Score], *, all_known: bool) -> None:
         table.add_row(name, *["-"] * 5, *_published(scores.THESIS.get(name)))
     Console(width=120).print(table)
     print(
-        f"true: within {scores.TOLERANCE_PX} px of the known geometry; >= 5 true: share of pairs with five such matches"
+        f"true: within {scores.TOLERANCE_PX} px of the known geometry; >= 5 true: share of pairs with five true matches"
     )
-    print("thesis: the same of other pictures, and seconds, as published in 2012")
+    print("thesis: the same for other images, and seconds, as published in 2012")
     if len(table.rows) > len(found):
         print("-: not in the installed build of OpenCV (see scripts/reproduce_features)")
     if found[0].skipped:
         print("skipped: " + ", ".join(f"{n} {reason}" for reason, n in found[0].skipped.items()))
     if found[0].unscored_pairs or found[0].rotation_pairs:
-        print(f"pairs without a reference: {found[0].unscored_pairs}; by rotation alone: {found[0].rotation_pairs}")
+        print(f"pairs without a reference: {found[0].unscored_pairs}; with rotation only: {found[0].rotation_pairs}")
 
 
 def _published(row: Published | None) -> tuple[str, ...]:

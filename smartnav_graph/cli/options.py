@@ -1,4 +1,4 @@
-"""What commands have in common: options, the configuration file under the flags, progress."""
+"""Common options of the commands, and the configuration file below the flags."""
 
 from __future__ import annotations
 
@@ -25,71 +25,72 @@ Repairs = Annotated[Text, tyro.conf.arg(name="repair", metavar="A,B")]
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A sub-command: its fields are its options, its docstring its help."""
+    """A sub-command: its fields are the options, its docstring is the help text."""
 
     quiet: Switch = False
-    """No progress."""
+    """Do not show progress."""
     debug: Switch = False
     """Show the traceback of an error."""
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Self | None:
-        """Defaults that depend on the arguments themselves; None takes those of the class."""
+        """Defaults that depend on the arguments; None for those of the class."""
         return None
 
     def run(self) -> None:
-        """Do it."""
+        """Execute the command."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Writing(Command):
-    """A command that writes to a place."""
+    """A command that writes files."""
 
     out: OutPath
-    """Where to write."""
+    """Output path."""
     force: Switch = False
-    """Replace what the command wrote there before."""
+    """Replace an older output of the command."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asking(Command):
-    """A session, and how to estimate on it."""
+class SessionCommand(Command):
+    """A session and the options of the estimation."""
 
     session: SourceName
     """Session folder, or a log of a known format (see `smartnav formats`)."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """config.toml; the options below go over it."""
+    """config.toml; the options below override it."""
     vehicle: Literal["none", "car", "trolley", "foot"] | None = None
-    """What carries the device, where the session does not say."""
+    """What carries the device; by default as in the session."""
     sensors: Annotated[Text, tyro.conf.arg(metavar="A,B,-C")] = None
-    """Streams to use, or with a minus to leave out."""
+    """Sensors to use, or with a minus to exclude."""
     withhold: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
-    """Rows to keep back and score: gnss:every=10 keeps each tenth fix, gnss:outage=100-130 drops 30 s; repeatable."""
+    """Measurements to withhold and to compare with the result: gnss:every=10 uses each tenth fix only,
+    gnss:outage=100-130 withholds 30 s; repeatable."""
     start: Annotated[float | None, tyro.conf.arg(name="from", metavar="S")] = None
-    """Begin here, seconds from the session's start."""
+    """Start time, seconds from the session's start."""
     end: Annotated[float | None, tyro.conf.arg(name="to", metavar="S")] = None
-    """End here, seconds from the session's start."""
+    """End time, seconds from the session's start."""
     initial: Annotated[Text, tyro.conf.arg(metavar="E,N,U,HEADING_DEG[,SIGMA_M,SIGMA_DEG]")] = None
-    """Where the start is, instead of finding it."""
+    """Initial position and heading, instead of the automatic initialisation."""
     rate: Annotated[Text, tyro.conf.arg(metavar="keyframes|imu|HZ")] = None
-    """Rate of the trajectory."""
+    """Output rate of the trajectory."""
     repair: Repairs = None
     """Repairs of faulty rows: nan, order, stamps."""
     options: Annotated[tyro.conf.FlagConversionOff[Config], tyro.conf.arg(name="")] = field(default_factory=Config)
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Self | None:
-        """The configuration file, where one is named."""
+        """The configuration file, if given."""
         file = _value_of("--config", arguments)
         if file is None:
             return None
         required = (f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING)
-        missing: dict[str, Any] = dict.fromkeys(required, tyro.MISSING)
+        missing = dict.fromkeys(required, tyro.MISSING)
         return cls(**missing, options=config_model.load(file))
 
     def resolved(self) -> Config:
-        """The configuration with the options over it."""
+        """The configuration with the options of the command line."""
         asked = given(
             vehicle=self.vehicle,
             sensors=None if self.sensors is None else names(self.sensors),
@@ -103,8 +104,8 @@ class Asking(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimating(Asking, Writing):
-    """What `smooth` and `replay` have in common."""
+class Estimating(SessionCommand, Writing):
+    """Common options of `smooth` and `replay`."""
 
 
 def given(**options: Any) -> dict[str, Any]:
@@ -132,9 +133,9 @@ def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:
-    """``--option -value`` as ``--option=-value``, and true, false of the configuration as Python spells them.
+    """``--option -value`` as ``--option=-value``, and true, false of the configuration as True, False.
 
-    No option has a short name but -h, so that a single leading minus after an option belongs to its value.
+    Only -h is a short option, so that a single leading minus after an option belongs to its value.
     """
     joined: list[str] = []
     for argument in arguments:

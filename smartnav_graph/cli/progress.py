@@ -1,4 +1,4 @@
-"""How far a long command is, on a terminal."""
+"""Progress of a long command, on a terminal."""
 
 from __future__ import annotations
 
@@ -7,20 +7,24 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 from smartnav_graph.core.progress import Progress, silent
 
-# Seconds between two drawings of the bar.
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import TaskID
+
+# Seconds between two updates of the bar.
 PERIOD_S = 0.1
 
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[Progress]:
-    """One line on stderr that says the stage, what is done of it, the rate and the time that is left; gone at the end.
+    """One line on stderr with stage, items done, rate and time left; removed at the end.
 
-    Gives a function of stage, done and total (0: not known, then the time that has passed stands there). Not a byte is
-    written where stderr is no terminal.
+    Gives a function of stage, done and total (0: unknown; then the elapsed time is shown). Nothing is written where
+    stderr is not a terminal.
     """
     if quiet or not sys.stderr.isatty():
         yield silent
@@ -29,15 +33,15 @@ def progress(quiet: bool) -> Iterator[Progress]:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"))
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"))
     with Bar(*columns, console=Console(file=sys.stderr), transient=True, refresh_per_second=1 / PERIOD_S) as bar:
-        yield _Line(bar, bar.add_task("", total=None, visible=False, told=""))
+        yield _Line(bar, bar.add_task("", total=None, visible=False, status=""))
 
 
 class _Line:
-    """The line of the stage at hand."""
+    """The line of the current stage."""
 
-    def __init__(self, bar: Any, task: Any) -> None:
+    def __init__(self, bar: Bar, task: TaskID) -> None:
         self._bar, self._task = bar, task
         self._stage, self._begun, self._drawn = "", 0.0, 0.0
 
@@ -49,27 +53,27 @@ class _Line:
         elif now - self._drawn < PERIOD_S and done < total:
             return
         self._drawn = now
-        told, whole = _Told(done, total, self._begun), total or None
+        status, whole = _Status(done, total, self._begun), total or None
         self._bar.update(
-            self._task, description=stage, completed=done, total=whole, told=told, visible=True, refresh=new
+            self._task, description=stage, completed=done, total=whole, status=status, visible=True, refresh=new
         )
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What stands behind the bar, at the moment it is drawn: of a stage of unknown length the time it has taken."""
+class _Status:
+    """The text behind the bar when it is drawn; of a stage of unknown length the elapsed time."""
 
     done: int
     total: int
     begun: float
 
     def __str__(self) -> str:
-        passed = time.perf_counter() - self.begun
-        return counted(self.done, self.total, passed) if self.total else time_text(passed)
+        elapsed = time.perf_counter() - self.begun
+        return counted(self.done, self.total, elapsed) if self.total else time_text(elapsed)
 
 
 def counted(done: int, total: int, seconds: float) -> str:
-    """What is done, how fast it goes and how long it still takes: ``120 of 505, 240/s, 2 s left``."""
+    """Items done, rate and time left: ``120 of 505, 240/s, 2 s left``."""
     if not done or seconds <= 0.0:
         return f"{done} of {total}"
     rate = done / seconds
@@ -78,7 +82,7 @@ def counted(done: int, total: int, seconds: float) -> str:
 
 
 def time_text(seconds: float) -> str:
-    """Seconds for people: ``2 s``, ``3 min 05 s``, ``1 h 02 min``."""
+    """Seconds as text: ``2 s``, ``3 min 05 s``, ``1 h 02 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

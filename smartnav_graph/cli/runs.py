@@ -1,4 +1,4 @@
-"""Commands that make a run, and that give it to other programs."""
+"""Commands that compute a run, and that export it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from smartnav_graph.estimate.run import Run, smooth
 from smartnav_graph.evaluation import Evaluation, evaluate
 from smartnav_graph.output.export import export, export_pictures
 from smartnav_graph.output.run_folder import StoredRun, check_out, read_run, write_run
+from smartnav_graph.output.summary_json import table_of, text_of
 from smartnav_graph.session.calibration import model as calibration_model
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smooth(Estimating):
-    """A session -> a run: the smoothed trajectory with its covariance, residuals, report and recording.
+    """Compute the trajectory of a session: smoothed states with covariance, residuals, report and recording.
 
     Example: smartnav smooth kitti --out kitti-run --withhold gnss:every=10
     """
@@ -37,9 +38,10 @@ class Smooth(Estimating):
 
 @dataclass(frozen=True, kw_only=True)
 class Replay(Estimating):
-    """One window at a time, causal; the final smoothed solution and the estimate of each moment are both written.
+    """Compute the causal trajectory of a session, one window at a time; both the final smoothed and the causal solution
+    are written.
 
-    Ctrl-C ends the replay and writes what is done.
+    Ctrl-C ends the replay and writes the part that is done.
 
     Example: smartnav replay kitti --out kitti-replay --smoother fixed-lag --lag 10
     """
@@ -47,7 +49,7 @@ class Replay(Estimating):
     smoother: Literal["fixed-lag", "isam2"] | None = None
     """The smoother."""
     lag: Annotated[float | None, tyro.conf.arg(metavar="S")] = None
-    """Seconds that the fixed-lag smoother keeps."""
+    """Lag of the fixed-lag smoother, seconds."""
 
     def resolved(self) -> Config:
         """With the smoother and its lag."""
@@ -59,7 +61,7 @@ class Replay(Estimating):
 
 
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> None:
-    """Load, estimate, write, tell."""
+    """Load, estimate, write, print."""
     check_out(command.out, command.force)
     with progress(command.quiet) as show:
         show(f"reading {command.session}", 0, 0)
@@ -69,18 +71,19 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
         run = (replay if causal else smooth)(session, config, progress=show)
         evaluation = against_own_reference(run)
         summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s, progress=show)
-    if "interrupted" in summary["mode"] and not command.quiet:
-        print("smartnav: interrupted; what was done until then is written", file=sys.stderr)
+    if "interrupted" in text_of(summary, "mode") and not command.quiet:
+        print("smartnav: interrupted; the part that was done is written", file=sys.stderr)
     print_findings(run_text(summary, command.out))
 
 
 def against_own_reference(run: Run) -> Evaluation | None:
-    """The comparison with the session's own reference, where it has one on the same clock."""
+    """The comparison with the session's own reference, if it has one."""
     if run.session.reference is None:
         return None
     try:
-        # a start that was not measured absolutely cannot agree in place and heading
-        align = "yaw" if "dead-reckoning" in run.summary["mode"] else "none"
+        # without an absolute position the start cannot agree in position and heading
+        relative = any(mode in run.summary["mode"] for mode in ("dead-reckoning", "visual-inertial"))
+        align = "yaw" if relative else "none"
         return evaluate(run.solution, run.session.reference, align=align, reference_name="reference.parquet")
     except SmartnavError as error:
         print(f"smartnav: not compared with the session's reference: {error}", file=sys.stderr)
@@ -89,10 +92,10 @@ def against_own_reference(run: Run) -> Evaluation | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Writing):
-    """A run for other programs: one file, or its pictures with their place.
+    """Export a run: one file, or the images of the session with their position.
 
-    images copies the pictures of the session into a folder, with position, direction, time and one sigma in their EXIF
-    and in geotags.csv; the originals are only read.
+    --format images copies the images of the session into a folder, with position, direction, time and one sigma in
+    their EXIF and in geotags.csv; the originals stay unchanged.
 
     Example: smartnav export kitti-run --format tum --out kitti.tum
     """
@@ -102,25 +105,25 @@ class Export(Writing):
     format: Literal["tum", "kml", "geojson", "gpx", "csv", "images"]
     """The format; kml, geojson, gpx and images need an origin."""
     solution: Literal["smoothed", "causal"] = "smoothed"
-    """Which of a replay's two."""
+    """Solution of a replay."""
     session: Annotated[Path | None, tyro.conf.arg(metavar="SESSION")] = None
-    """For images: where the session is, if not where it was smoothed."""
+    """For images: the session, if it was moved."""
 
     def run(self) -> None:
         run = read_run(self.run_path)
         if self.format == "images":
             self._pictures(run)
             return
-        if self.out.is_dir():  # --force is for an older export, not for a folder
+        if self.out.is_dir():  # --force replaces an older export, not a folder
             raise SessionError(self.out, "is a folder", "the name of a file", "choose another --out")
         export(run.named(self.solution), self.format, self.out, force=self.force, clock_epoch=run.clock_epoch)
         print(f"{self.format}: {self.out}")
 
     def _pictures(self, run: StoredRun) -> None:
-        source = self.session or run.summary["session"].get("source")
-        if source is None or not Path(source).exists():
-            found = "does not say where its session is" if source is None else f"came from {source}, which is not there"
-            raise SessionError(self.run_path, found, "a session with pictures", "give --session")
+        source = self.session or text_of(table_of(run.summary, "session"), "source")
+        if not source or not Path(source).exists():
+            found = f"was computed from {source}, which does not exist" if source else "does not name its session"
+            raise SessionError(self.run_path, found, "a session with images", "give --session")
         with progress(self.quiet) as show:
             show(f"reading {source}", 0, 0)
             done = export_pictures(
@@ -128,7 +131,7 @@ class Export(Writing):
                 readers.load(source),
                 self.out,
                 calibration=calibration_model.load_calibration(self.run_path / "calibration.toml"),
-                states=run.summary.get("states"),
+                states=table_of(run.summary, "states"),
                 force=self.force,
                 progress=show,
             )

@@ -1,26 +1,25 @@
-"""Commands that say how good a run is."""
+"""The command that compares a run with a reference."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from smartnav_graph.cli.options import Command, RunPath, Switch
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.cli.text import statistics_line
+from smartnav_graph.cli.text import print_json, statistics_line
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.evaluation import Evaluation, evaluate
-from smartnav_graph.output.run_folder import plain, read_run
+from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.readers.reference import load_reference
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Command):
-    """A run against a reference: absolute and relative errors, percentiles, consistency (NEES).
+    """Compare a run with a reference trajectory: absolute and relative errors, percentiles, consistency (NEES).
 
     Example: smartnav evaluate walk-run --reference walk --align yaw --json
     """
@@ -34,11 +33,11 @@ class Evaluate(Command):
     body_T_ref: Annotated[Path | None, tyro.conf.arg(name="body-T-ref", metavar="FILE")] = None
     """TOML with the pose of the reference's frame in the body, a 4x4 matrix body_T_<name>."""
     align: Literal["none", "yaw", "se3", "sim3"] = "none"
-    """What to fit to the reference before comparing."""
+    """Transformation to estimate before comparing."""
     solution: Literal["smoothed", "causal"] = "smoothed"
-    """Which of a replay's two."""
+    """Solution of a replay."""
     time_offset: Annotated[str, tyro.conf.arg(metavar="S|auto")] = "0"
-    """Added to the stamps of the reference; auto finds it."""
+    """Added to the time stamps of the reference; auto estimates it."""
     json: Switch = False
     """Print JSON, and nothing else, on stdout."""
 
@@ -57,10 +56,13 @@ class Evaluate(Command):
                 solution_name=self.solution,
                 reference_name=str(self.reference),
             )
-        print(json.dumps(plain(found.to_dict()), allow_nan=False) if self.json else evaluation_text(found))
+        if self.json:
+            print_json(found.to_dict())
+        else:
+            print(evaluation_text(found))
 
 
-def _offset(text: str) -> Any:
+def _offset(text: str) -> float | Literal["auto"]:
     try:
         return "auto" if text == "auto" else float(text)
     except ValueError as error:
@@ -68,7 +70,7 @@ def _offset(text: str) -> Any:
 
 
 def evaluation_text(found: Evaluation) -> str:
-    """The figures of an evaluation for people."""
+    """The figures of an evaluation as text."""
     rotation = None if found.rotation_deg is None else asdict(found.rotation_deg)
     lines = [
         f"{found.solution} against {found.reference}: {found.matched} epochs matched, {found.unmatched} outside; "

@@ -19,7 +19,7 @@ HEADER = "session.toml"
 
 @dataclass(frozen=True, kw_only=True)
 class Formats(Command):
-    """The readers, one line each, and how a file is recognised.
+    """List the formats that can be imported, and how they are recognised.
 
     Example: smartnav formats
     """
@@ -33,7 +33,7 @@ class Formats(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Writing):
-    """A foreign log -> a session folder: units and signs are changed, axes and the clock are kept.
+    """Import a log of another program into a session folder: units and signs are converted, axes and clock are kept.
 
     Example: smartnav import gtsam-kitti --out kitti
     """
@@ -41,7 +41,7 @@ class Import(Writing):
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """A file, folder or archive, or gtsam-kitti, gtsam-euroc."""
     format: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
-    """The format, where the content does not tell (see `smartnav formats`)."""
+    """The format, if it is not recognised (see `smartnav formats`)."""
     repair: Repairs = None
     """Repairs of faulty rows: nan, order, stamps."""
 
@@ -59,7 +59,7 @@ class Import(Writing):
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Command):
-    """What a session holds: streams, rates, gaps, clock, gravity check, what is missing, what looks wrong.
+    """Check a session: streams, rates, data gaps, clock, gravity, missing streams, possible faults.
 
     Example: smartnav info kitti
     """
@@ -81,18 +81,18 @@ class Info(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Writing):
-    """A named simulated session; its truth stands in reference.parquet. Its constants are printed.
+    """Simulate a session; the ground truth is written to reference.parquet. Its constants are printed.
 
     Example: smartnav simulate walk-60s --seed 1 --out walk
 
-    room-30s has tracks, trolley-20min matches of images that were never taken, rendered-room-10s pictures. They start
-    at rest in the origin, facing north, which is what a start without fixes takes for granted.
+    room-30s has tracks, trolley-20min simulated matches, rendered-room-10s images. They start at rest at the origin,
+    heading north, as an initialisation without fixes assumes.
     """
 
     scenario: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
-    """For example walk-60s, car-10min, trolley-20min; a wrong name lists them all."""
+    """For example walk-60s, car-10min, trolley-20min; an unknown name lists all."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Of every random draw."""
+    """Seed of the random numbers."""
 
     def run(self) -> None:
         from smartnav_graph.simulation import recording, scenarios
@@ -109,7 +109,7 @@ class Simulate(Writing):
 
 @dataclass(frozen=True, kw_only=True)
 class DegradeSession(Writing):
-    """A session -> a noisier, faulty one: worse fixes, outliers, missing, jittered, repeated, swapped, broken rows.
+    """Add noise and faults to a session: noisier fixes, outliers, missing, jittered, repeated, swapped, invalid rows.
 
     Example: smartnav degrade kitti --gnss-white 3 --gnss-gm 4,60 --seed 0 --out kitti-phone
     """
@@ -117,23 +117,23 @@ class DegradeSession(Writing):
     session: SourceName
     """Session folder, or a log of a known format."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")]
-    """Of every random draw."""
+    """Seed of the random numbers."""
     gnss_white: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """White noise of the fixes, metres a horizontal axis; 1.5 times as much in height."""
+    """White noise of the fixes, metres on each horizontal axis; 1.5 times as much in height."""
     gnss_gm: Annotated[Text, tyro.conf.arg(metavar="M,S")] = None
-    """Gauss-Markov error of the fixes: sigma in metres, correlation time in seconds."""
+    """Correlated error of the fixes (Gauss-Markov): sigma in metres, correlation time in seconds."""
     outliers: Annotated[Text, tyro.conf.arg(metavar="KIND:SHARE:LOW-HIGH")] = None
     """Outliers of the fixes, such as isolated:0.05:50-200 or burst:0.05:50-200 (metres)."""
     drop_imu: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="T,S")] = ()
-    """Leave out S seconds of inertial rows from T on; repeatable."""
+    """Remove S seconds of IMU samples from T on; repeatable."""
     jitter_ms: Annotated[float, tyro.conf.arg(metavar="MS")] = 0.0
-    """Jitter of the inertial stamps, one sigma."""
+    """Jitter of the IMU time stamps, one sigma."""
     duplicates: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.0
-    """Share of inertial rows repeated."""
+    """Share of IMU samples repeated."""
     swaps: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.0
-    """Share of inertial rows swapped with the next."""
+    """Share of IMU samples swapped with the next."""
     nan_rows: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.0
-    """Share of inertial rows with a value that is not a number."""
+    """Share of IMU samples with an invalid value (NaN)."""
 
     def run(self) -> None:
         from smartnav_graph import readers
@@ -153,14 +153,14 @@ class DegradeSession(Writing):
         with progress(self.quiet) as show:
             show(f"reading {self.session}", 0, 0)
             session = readers.load(self.session)
-            told = rules.write_degraded(session, options, self.seed, self.out, force=self.force, progress=show)
-        print(session_text(told))
+            degraded = rules.write_degraded(session, options, self.seed, self.out, force=self.force, progress=show)
+        print(session_text(degraded))
         print(f"session: {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(Command):
-    """Sessions and runs in the Rerun viewer, beside each other; returns when it is closed.
+    """Show sessions and runs in the Rerun viewer, together; returns when it is closed.
 
     Example: smartnav view kitti-run --web
     """
@@ -168,7 +168,7 @@ class View(Command):
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SESSION|RUN")]
     """Session folders, run folders, .rrd files."""
     web: Switch = False
-    """In a browser instead of a window."""
+    """Use a browser instead of a window."""
 
     def run(self) -> None:
         from smartnav_graph.output.rerun_log import view
@@ -177,6 +177,6 @@ class View(Command):
 
 
 def check_session_out(path: Path, force: bool) -> None:
-    """Raise unless a session may be written to `path`: a free place, or with `force` an older session."""
+    """Check that a session may be written to `path`: it does not exist, or `force` is given for an older session."""
     refuse_existing(path, force)
     refuse_foreign(path, HEADER)

@@ -1,18 +1,19 @@
-"""What commands say."""
+"""Text output of the commands."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
+from smartnav_graph.output.summary_json import Summary, imu_gaps, list_of, numbers_of, plain, table_of, text_of
 from smartnav_graph.session.session import Session
 
 STYLES = {"error:": "bold red", "warning:": "yellow", "missing:": "cyan"}
 
 
 def print_findings(text: str) -> None:
-    """Lines on stdout, coloured by how bad they are where the terminal can."""
+    """Lines on stdout, coloured by severity on a terminal."""
     from rich.console import Console
     from rich.text import Text
 
@@ -22,7 +23,7 @@ def print_findings(text: str) -> None:
 
 
 def session_text(session: Session) -> str:
-    """Device and streams, and what was repaired."""
+    """Device, streams and repairs."""
     streams = ", ".join(f"{name} {len(stream)}" for name, stream in session.streams().items())
     device = session.device
     lines = [
@@ -34,37 +35,43 @@ def session_text(session: Session) -> str:
     return "\n".join(lines)
 
 
-def run_text(summary: Mapping[str, Any], out: Path) -> str:
-    """What a run found, in a few lines."""
-    timings, chi2 = summary["timings_s"], summary["chi2_per_dof"]
+def print_json(value: object) -> None:
+    """JSON on stdout."""
+    print(json.dumps(plain(value), allow_nan=False))
+
+
+def run_text(summary: Summary, out: Path) -> str:
+    """The result of a run in a few lines."""
+    timings, chi2 = numbers_of(summary, "timings_s"), numbers_of(summary, "chi2_per_dof")
     lines = [
         f"{summary['mode']}: {summary['duration_s']:.1f} s, path {summary['path_m']:.1f} m, "
         f"{summary['keyframes']} keyframes, in {timings['total']:.1f} s",
-        f"start: {summary['initialisation']['sentence']}",
+        f"start: {text_of(table_of(summary, 'initialisation'), 'sentence')}",
         f"chi2 per degree of freedom: {', '.join(f'{name} {value:.2f}' for name, value in chi2.items())}",
         "horizontal sigma: median {median:.3f} m, 95 % {p95:.3f} m, largest {max:.3f} m".format_map(
-            summary["position_sigma_m"]
+            numbers_of(summary, "position_sigma_m")
         ),
     ]
-    if summary.get("update_ms"):
-        lines.append(
-            "update: median {median:.1f} ms, 99 % {p99:.1f} ms, largest {max:.1f} ms".format_map(summary["update_ms"])
-        )
-    if summary["gaps"]:
-        missing = sum(gap["length_s"] for gap in summary["gaps"])
-        lines.append(f"inertial gaps: {len(summary['gaps'])}, {missing:.2f} s in all")
-    lines += [f"rejected: {name} {count}" for name, count in summary["rejected"].items() if count]
+    update = numbers_of(summary, "update_ms")
+    if update:
+        lines.append("update: median {median:.1f} ms, 99 % {p99:.1f} ms, largest {max:.1f} ms".format_map(update))
+    gaps = imu_gaps(summary)
+    if gaps:
+        lines.append(f"IMU data gaps: {len(gaps)}, {sum(gap.length_s for gap in gaps):.2f} s in all")
+    lines += [f"rejected: {name} {count:.0f}" for name, count in numbers_of(summary, "rejected").items() if count]
     lines += withheld_lines(summary)
-    lines += [f"warning: {text}" for text in summary["warnings"]]
+    lines += [f"warning: {text}" for text in list_of(summary, "warnings")]
     return "\n".join([*lines, f"run: {out} (report.html, run.rrd, trajectory.csv, summary.json)"])
 
 
-def withheld_lines(summary: Mapping[str, Any]) -> list[str]:
-    """One line a sensor whose rows were kept back."""
+def withheld_lines(summary: Summary) -> list[str]:
+    """One line for each sensor with withheld measurements."""
+    withheld = table_of(summary, "withheld")
+    scores = {name: numbers_of(withheld, name) for name in withheld}
     return [
-        f"withheld {name}: {w['count']} rows, horizontal RMS {w['rms_horizontal_m']:.3f} m, "
+        f"withheld {name}: {w['count']:.0f} rows, horizontal RMS {w['rms_horizontal_m']:.3f} m, "
         f"3-D RMS {w['rms_3d_m']:.3f} m, largest {w['max_m']:.3f} m"
-        for name, w in summary["withheld"].items()
+        for name, w in scores.items()
     ]
 
 
@@ -72,5 +79,5 @@ def statistics_line(name: str, unit: str, values: Mapping[str, float] | None) ->
     """RMS, mean and percentiles of an error."""
     if values is None:
         return f"{name:<12}unknown"
-    told = " ".join(f"{key} {values[key]:.3f}" for key in ("rmse", "mean", "p50", "p67", "p95", "max"))
-    return f"{name:<12}{told} {unit}"
+    figures = " ".join(f"{key} {values[key]:.3f}" for key in ("rmse", "mean", "p50", "p67", "p95", "max"))
+    return f"{name:<12}{figures} {unit}"

@@ -39,19 +39,10 @@ from smartnav_graph.session.streams import STREAMS
 # The inertial builder comes first: it predicts the state that the others refer to.
 FACTORS: Mapping[str, Factor] = {
     "prior": Factor(
-        Label(
-            "Start",
-            "prior",
-            "priors",
-            "the prior on the initial state",
-            "the initial state, as found or given",
-            (150, 150, 150),
-        ),
+        Label("Initial state", assumes="prior on the initial state", colour=(150, 150, 150)),
         config=prior.PriorConfig,
         section="prior",
-        parts={
-            "rest": Label("Rest at the start", "zero velocity", "zero velocities", assumes="the device did not move")
-        },
+        parts={"rest": Label("Standstill at the start", assumes="zero velocity at the start")},
     ),
     "imu": Factor(
         STREAMS["imu"].LABEL,
@@ -60,16 +51,8 @@ FACTORS: Mapping[str, Factor] = {
         "imu",
         "imu",
         {
-            "imu_bias": Label(
-                "IMU bias walk",
-                "bias step",
-                "bias steps",
-                assumes="biases of the IMU change slowly",
-                colour=(200, 110, 70),
-            ),
-            "imu_straying": Label(
-                "Gap error model", "gap error", "gap errors", assumes="errors of motion interpolated in IMU data gaps"
-            ),
+            "imu_bias": Label("IMU bias random walk", assumes="biases change slowly", colour=(200, 110, 70)),
+            "imu_straying": Label("Gap error model", assumes="error of the motion inside IMU data gaps"),
         },
     ),
     "gnss": Factor(
@@ -80,10 +63,7 @@ FACTORS: Mapping[str, Factor] = {
         "gnss",
         {
             "gnss_wander": Label(
-                "Correlated GNSS error",
-                "correlated error",
-                "correlated errors",
-                assumes="errors of successive fixes are alike (Gauss-Markov)",
+                "Correlated GNSS error (Gauss-Markov)", assumes="successive fixes have correlated errors"
             )
         },
     ),
@@ -92,7 +72,7 @@ FACTORS: Mapping[str, Factor] = {
         STREAMS["pose_fixes"].LABEL, pose_fix.build, pose_fix.PoseFixConfig, "pose_fixes", "pose_fixes"
     ),
     "pose_attitude": Factor(
-        Label("Attitude of pose fixes", "attitude", "attitudes", "the attitude of the pose fixes"),
+        Label("Attitude of pose fixes"),
         pose_fix.build_attitude,
         pose_fix.PoseFixConfig,
         "pose_fixes",
@@ -106,17 +86,12 @@ FACTORS: Mapping[str, Factor] = {
         "standstill",
         "static",
         {
-            "static_turn": Label(
-                "Zero angular rate updates (ZARU)",
-                "zero angular rate update",
-                "zero angular rate updates",
-                assumes="the device did not turn while at rest",
-            ),
-            "static_level": Label("Flat floor", "floor height", "floor heights", assumes="the floor is flat"),
+            "static_turn": Label("Zero angular rate updates (ZARU)", assumes="zero angular rate while at rest"),
+            "static_level": Label("Flat floor", assumes="the floor is flat"),
         },
     ),
     "gnss_velocity": Factor(
-        Label("GNSS velocity", "GNSS velocity", "GNSS velocities"),
+        Label("GNSS velocity"),
         velocity.build_gnss,
         velocity.VelocityConfig,
         "velocity",
@@ -124,13 +99,7 @@ FACTORS: Mapping[str, Factor] = {
     ),
     "velocity": Factor(STREAMS["velocity"].LABEL, velocity.build, velocity.VelocityConfig, "velocity", "velocity"),
     "vehicle": Factor(
-        Label(
-            "Vehicle",
-            "vehicle row",
-            "vehicle rows",
-            "the vehicle constraint",
-            assumes="wheels do not slide sideways or leave the road",
-        ),
+        Label("Vehicle constraint", assumes="wheels move neither sideways nor off the road"),
         vehicle.build,
         vehicle.VehicleConfig,
         "vehicle",
@@ -144,17 +113,11 @@ FACTORS: Mapping[str, Factor] = {
         "magnetometer",
     ),
     "gravity": Factor(
-        Label(
-            "Gravity",
-            "tilt from gravity",
-            "tilts from gravity",
-            "gravity as the level",
-            assumes="the mean of the specific force points up",
-        ),
+        Label("Gravity", assumes="the mean specific force is vertical"),
         gravity.build,
         gravity.GravityConfig,
         "gravity",
-        parts={"pace": Label("Walking pace", "pace", "paces", assumes="a person does not move fast")},
+        parts={"pace": Label("Walking pace", assumes="a pedestrian moves slowly")},
     ),
     "barometer": Factor(
         STREAMS["barometer"].LABEL,
@@ -162,29 +125,23 @@ FACTORS: Mapping[str, Factor] = {
         barometer.BarometerConfig,
         "barometer",
         "barometer",
-        {"barometer_bias": Label("Pressure drift", "drift", "drifts", assumes="the weather changes slowly")},
+        {"barometer_bias": Label("Barometer bias random walk", assumes="the pressure offset changes slowly")},
     ),
     "steps": Factor(
-        Label(
-            "Steps",
-            "stretch of steps",
-            "stretches of steps",
-            "the steps",
-            assumes="how long a walker's steps are, and where they lead",
-        ),
+        Label("Steps", assumes="length and direction of a pedestrian's steps"),
         pedestrian.build,
         pedestrian.StepConfig,
         "steps",
     ),
     "image_pairs": Factor(
-        Label("Image pairs", "image pair", "image pairs", colour=(225, 180, 20)),
+        Label("Image pairs", colour=(225, 180, 20)),
         coplanarity.build,
         coplanarity.CoplanarityConfig,
         "image_pairs",
         "matches",
     ),
     "smart": Factor(
-        Label("Tracks in space", "track", "tracks", "the image tracks"),
+        Label("Tracked points in space"),
         smart.build,
         smart.SmartConfig,
         "smart",
@@ -201,9 +158,13 @@ _LABELS = {
 
 def label_of(name: str) -> Label:
     """Label of a stream, a factor or a part of one, by its name; made of the name where it is unknown."""
-    words = name.replace("_", " ")
-    unknown = Label(words[:1].upper() + words[1:], f"{name} measurement", f"{name} measurements", name)
-    return _LABELS.get(name, unknown)
+    text = name.replace("_", " ")
+    return _LABELS.get(name, Label(text[:1].upper() + text[1:]))
+
+
+def title_of(name: str) -> str:
+    """Title of a stream, a factor or a part of one."""
+    return label_of(name).title
 
 
 def builder_of(sensor: str) -> str:

@@ -18,7 +18,7 @@ class Factor:
     build : makes the builder, None where a session has no use for it; the prior has none, the initialisation makes it
     config, section : class of its options and name of their section in config.toml; a section may serve several factors
     stream : the stream that it reads, if any
-    label : words and colour for people
+    label : title and colour
     parts : labels of its factors that carry a name of their own, such as the bias random walk of the inertial data
     """
 

@@ -1,16 +1,17 @@
-"""Two runs beside each other: how far apart their states are, and what else tells them apart."""
+"""Comparison of two runs: differences of their states, options, rejected rows and summary figures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from smartnav_graph.evaluation.compare import MEASURES, Comparison, Measure, compare, figure_differences, rejected_sets
 from smartnav_graph.output.run_folder import StoredRun, config_differences
+from smartnav_graph.output.text import Row, Table
 
-# Rows of one sensor that only one run rejected, told one by one.
+# Up to so many rows that only one run rejected are listed one by one.
 FEW = 8
 COLUMNS = ("RMS", "median", "95 %", "largest", "at s", "in sigmas", "sigma 2/1")
 MEANING = (
@@ -26,29 +27,29 @@ class RunDifferences:
     first: StoredRun
     second: StoredRun
     states: Comparison
-    config: Mapping[str, tuple[Any, Any]]
+    config: Mapping[str, tuple[object, object]]
     rejected: Mapping[str, Mapping[str, Any]]
-    figures: Mapping[str, tuple[Any, Any]]
+    figures: Mapping[str, tuple[object, object]]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Every difference."""
         tables = {"config": self.config, "rejected": self.rejected, "figures": self.figures}
         return {"first": str(self.first.path), "second": str(self.second.path), **self.states.to_dict(), **tables}
 
     def to_text(self) -> str:
-        """For people: tables in fixed width."""
+        """Tables in fixed width."""
         states = "\n".join([self._title(), *self._states()])
         tables = [table for name in ("config", "figures") if (table := self._table(name))]
         return "\n\n".join([states, *tables, *(["\n".join(lines)] if (lines := list(self._rejected())) else [])])
 
     def to_markdown(self) -> str:
-        """The same as a document."""
-        names, rows = COLUMNS, [self._row(measure) for measure in MEASURES]
-        tables = [_markdown(("", *names), rows), MEANING]
+        """The same as Markdown."""
+        tables = [Table(("", *COLUMNS), [Row(self._row(measure)) for measure in MEASURES])]
         for name in ("config", "figures"):
-            told = [(key, _told(one), _told(other)) for key, (one, other) in getattr(self, name).items()]
-            tables += [_markdown((name, self.first.path.name, self.second.path.name), told)] if told else []
-        return "\n\n".join([self._title(), *tables, *(f"- {line}" for line in self._rejected())])
+            rows = [Row((key, _shown(one), _shown(other))) for key, (one, other) in getattr(self, name).items()]
+            tables += [Table((name, self.first.path.name, self.second.path.name), rows)] if rows else []
+        first, *rest = (table.markdown() for table in tables)
+        return "\n\n".join([self._title(), first, MEANING, *rest, *(f"- {line}" for line in self._rejected())])
 
     def write_recording(self, path: Path, *, force: bool) -> None:
         """Both runs as one recording; see `rerun_log.comparison`."""
@@ -67,15 +68,15 @@ class RunDifferences:
 
     def _title(self) -> str:
         counts = [len(run.solution) for run in (self.first, self.second)]
-        few = "; the same --rate HZ gives both more of them" if 2 * len(self.states) < min(counts) else ""
+        few = "; use the same --rate HZ for both to get more" if 2 * len(self.states) < min(counts) else ""
         common = f"{len(self.states)} common epochs (of {counts[0]} and {counts[1]}{few})"
-        return f"{self.second.path} less {self.first.path} at {common}"
+        return f"{self.second.path} minus {self.first.path} at {common}"
 
     def _states(self) -> Iterator[str]:
         yield f"{'':<16}{''.join(f'{name:>11}' for name in COLUMNS)}"
         for measure in MEASURES:
-            name, *told = self._row(measure)
-            yield f"{name:<16}{''.join(f'{text:>11}' for text in told)}"
+            name, *cells = self._row(measure)
+            yield f"{name:<16}{''.join(f'{text:>11}' for text in cells)}"
         yield MEANING
 
     def _row(self, measure: Measure) -> tuple[str, ...]:
@@ -86,8 +87,8 @@ class RunDifferences:
         return (name, *figures, f"{one.largest_at_s:.2f}", f"{one.largest_sigmas:.2f}", f"{one.sigma_ratio:.3f}")
 
     def _table(self, name: str) -> str:
-        rows: Mapping[str, tuple[Any, Any]] = getattr(self, name)
-        return "\n".join(f"{name:<8} {key}: {_told(one)} | {_told(other)}" for key, (one, other) in rows.items())
+        rows: Mapping[str, tuple[object, object]] = getattr(self, name)
+        return "\n".join(f"{name:<8} {key}: {_shown(one)} | {_shown(other)}" for key, (one, other) in rows.items())
 
     def _rejected(self) -> Iterator[str]:
         for sensor, sets in self.rejected.items():
@@ -113,19 +114,14 @@ def compare_runs(first: StoredRun, second: StoredRun) -> RunDifferences:
     )
 
 
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def _rows(rows: list[int]) -> str:
-    """How many rows, and which where they are few."""
+    """The number of rows; few are listed."""
     return f"{len(rows)} (rows {', '.join(map(str, rows))})" if 0 < len(rows) <= FEW else str(len(rows))
 
 
-def _told(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_told, value))}]"
+        return f"[{', '.join(map(_shown, value))}]"
     return "-" if value is None else str(value)

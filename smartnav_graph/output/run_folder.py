@@ -1,15 +1,14 @@
 """The folder a run leaves behind, and reading it back.
 
 trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
-keyframes.parquet, influence.parquet (the linear system at the solution, see `influence`), summary.json, config.toml,
-calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
+keyframes.parquet, influence.parquet (the linear system at the solution, see `evaluation.influence`), summary.json,
+config.toml, calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing, write_table
@@ -30,10 +30,15 @@ from smartnav_graph.evaluation.influence import Influence
 from smartnav_graph.graph import solution as solution_model
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.output.export import write_trajectory_csv
+from smartnav_graph.output.summary_json import Summary, as_float, numbers_of, plain, table_of, text_of
 from smartnav_graph.session.calibration import model as calibration_model
 from smartnav_graph.session.session import Session
+from smartnav_graph.session.stream import Stream
+
+Columns = dict[str, NDArray[np.generic]]
 
 SUMMARY = "summary.json"
+# Parts of a summary that differ between equal runs.
 UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")
 
 
@@ -43,12 +48,12 @@ class StoredRun:
 
     path: Path
     solution: Solution
-    summary: Mapping[str, Any]
+    summary: Summary
     causal: Solution | None = None
 
     @property
     def clock_epoch(self) -> str:
-        return str(self.summary["session"].get("clock_epoch", "unknown"))
+        return text_of(table_of(self.summary, "session"), "clock_epoch") or "unknown"
 
     def named(self, name: str) -> Solution:
         """The ``smoothed`` or the ``causal`` solution.
@@ -56,7 +61,7 @@ class StoredRun:
         Raises
         ------
         SessionError
-            A causal one is asked of a batch run.
+            The causal one of a batch run.
         """
         if name == "smoothed":
             return self.solution
@@ -66,12 +71,12 @@ class StoredRun:
 
 
 def check_out(path: str | Path, force: bool) -> None:
-    """Raise unless a run may be written to `path`: a free place, or with `force` an older run.
+    """Check that a run may be written to `path`: it does not exist, or `force` is given and it is an older run.
 
     Raises
     ------
     SessionError
-        Something stands there.
+        The path is taken.
     """
     refuse_existing(Path(path), force)
     refuse_foreign(path, SUMMARY)
@@ -87,7 +92,7 @@ def write_run(
     evaluation: Evaluation | None = None,
     load_s: float = 0.0,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> Summary:
     """Write the folder of a run, all or nothing.
 
     Parameters
@@ -95,9 +100,9 @@ def write_run(
     run : what `estimate.smooth` or `estimate.replay` gave
     force : replace an older run; a folder that is no run is never replaced
     report, recording : write report.html, run.rrd
-    evaluation : comparison with a reference, shown in both and told in summary.json
+    evaluation : comparison with a reference, shown in both and written to summary.json
     load_s : seconds that reading the session took
-    progress : told what is being written
+    progress : called with what is being written
 
     Returns
     -------
@@ -106,15 +111,15 @@ def write_run(
     Raises
     ------
     SessionError
-        The place is taken, or the system refuses to write; what stood there is untouched.
+        The path is taken, or the system refuses to write; an older run is untouched.
     """
     check_out(path, force)
     begin = time.perf_counter()
-    told = dict(run.summary)
-    told["session"] = dict(told.get("session", {})) | _session_key(run)
+    summary: dict[str, object] = dict(run.summary)
+    summary["session"] = {**table_of(summary, "session"), **_session_key(run)}
     if evaluation is not None:
-        told["evaluation"] = evaluation.to_dict()
-    told["timings_s"] = {"load": round(load_s, 4), **told.get("timings_s", {})}
+        summary["evaluation"] = evaluation.to_dict()
+    summary["timings_s"] = {"load": round(load_s, 4), **table_of(summary, "timings_s")}
     with replacing(path, force=force) as folder:
         try:
             folder.mkdir()
@@ -123,16 +128,21 @@ def write_run(
             (folder / "config.toml").write_text(config_model.dumps(run.problem.config), encoding="utf-8")
             calibration = calibration_model.calibration_toml(run.problem.calibration)
             (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
-            _write_views(run, folder, plain(told), evaluation, report, recording, progress)
-            summary = plain(_timed(told, load_s, time.perf_counter() - begin))
-            text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+            views = {"report": report, "recording": recording}
+            _write_views(run, folder, _plain_table(summary), evaluation, views, progress)
+            written = _plain_table(_timed(summary, load_s, time.perf_counter() - begin))
+            text = json.dumps(written, indent=2, ensure_ascii=False, allow_nan=False)
             (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
-        except SessionError as error:  # from a file inside: speak of the run, not of the temporary name
+        except SessionError as error:  # raised for a file inside: name the run, not the temporary folder
             raise error.located(path) from error
-    return dict(summary)
+    return written
 
 
-def _session_key(run: Run) -> dict[str, Any]:
+def _plain_table(summary: Summary) -> Summary:
+    return {key: plain(value) for key, value in summary.items()}
+
+
+def _session_key(run: Run) -> dict[str, object]:
     """What reading the states back needs of the session."""
     solution, session = run.solution, run.session
     return {
@@ -145,12 +155,13 @@ def _session_key(run: Run) -> dict[str, Any]:
     }
 
 
-def _timed(told: Mapping[str, Any], load_s: float, write_s: float) -> dict[str, Any]:
+def _timed(summary: Summary, load_s: float, write_s: float) -> Summary:
     """With loading and writing in the timings, the total and the real-time factor."""
-    timings = dict(told["timings_s"])
+    timings = numbers_of(summary, "timings_s")
     total = timings.pop("total", 0.0) + load_s + write_s
     timings |= {"write": round(write_s, 4), "total": round(total, 4)}
-    return {**told, "timings_s": timings, "real_time_factor": round(told["duration_s"] / max(total, 1e-9), 2)}
+    duration = as_float(summary.get("duration_s")) or 0.0
+    return {**summary, "timings_s": timings, "real_time_factor": round(duration / max(total, 1e-9), 2)}
 
 
 def _write_tables(run: Run, folder: Path) -> None:
@@ -168,7 +179,7 @@ def _write_tables(run: Run, folder: Path) -> None:
         Influence.of(run.estimate, run.problem.windows).write(folder)
 
 
-def residual_columns(residuals: Residuals) -> dict[str, Any]:
+def residual_columns(residuals: Residuals) -> Columns:
     """The columns of residuals.parquet."""
     return {
         "t_ns": residuals.t_ns,
@@ -180,7 +191,7 @@ def residual_columns(residuals: Residuals) -> dict[str, Any]:
     }
 
 
-def withheld_columns(run: Run) -> dict[str, Any]:
+def withheld_columns(run: Run) -> Columns:
     """The columns of withheld.parquet: predicted minus recorded, metres; empty without withheld rows."""
     if not run.withheld:
         return {}
@@ -192,13 +203,13 @@ def withheld_columns(run: Run) -> dict[str, Any]:
 
 
 def recorded(run: Run) -> Session:
-    """The session of a run with the rows kept back, as far as the run reaches, at their places again."""
-    whole: dict[str, Any] = {}
+    """The session of a run, its withheld rows inside the run put back in their places."""
+    whole: dict[str, Stream] = {}
     start, end = run.solution.t_ns[[0, -1]]
-    for name, held in run.problem.withheld.items():
-        rows = held.take((held.t_ns >= start) & (held.t_ns <= end))
-        kept = getattr(run.session, name)
-        parts = [rows.columns()] if kept is None else [kept.columns(), rows.columns()]
+    for name, withheld in run.problem.withheld.items():
+        rows = withheld.take((withheld.t_ns >= start) & (withheld.t_ns <= end))
+        used = run.session.streams().get(name)
+        parts = [rows.columns()] if used is None else [used.columns(), rows.columns()]
         table = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
         order = np.argsort(table["t_ns"], kind="stable")
         whole[name] = type(rows).from_columns({column: values[order] for column, values in table.items()})
@@ -208,42 +219,43 @@ def recorded(run: Run) -> Session:
 def _write_views(
     run: Run,
     folder: Path,
-    told: Mapping[str, Any],
+    summary: Summary,
     evaluation: Evaluation | None,
-    report: bool,
-    recording: bool,
+    views: Mapping[str, bool],
     progress: Progress,
 ) -> None:
     from smartnav_graph.output.report import report_markdown, write_report
     from smartnav_graph.output.rerun_log import write_latency, write_recording
 
-    common: dict[str, Any] = {"session": recorded(run), "solution": run.solution, "summary": told}
-    common |= {"evaluation": evaluation, "causal": run.causal}
-    if recording:
+    session, updates = recorded(run), None if run.trace is None else run.trace.updates
+    if views["recording"]:
         progress("writing the recording", 0, 0)
         # a summary without its timings: equal runs give equal recordings
-        steady = {key: value for key, value in told.items() if key not in UNSTEADY}
-        markdown = report_markdown(steady, evaluation)
-        identity = write_recording(folder / "run.rrd", report_markdown=markdown, trace=run.trace, **common)
-        if run.trace is not None and run.trace.updates is not None:
-            write_latency(folder / "latency.rrd", session=run.session, trace=run.trace, identity=identity)
-    if report:
+        steady = {key: value for key, value in summary.items() if key not in UNSTEADY}
+        identity = write_recording(
+            folder / "run.rrd",
+            session=session,
+            solution=run.solution,
+            summary=summary,
+            evaluation=evaluation,
+            causal=run.causal,
+            diagnostics=run.trace,
+            report_markdown=report_markdown(steady, evaluation),
+        )
+        if run.trace is not None and updates is not None:
+            write_latency(folder / "latency.rrd", session=run.session, diagnostics=run.trace, identity=identity)
+    if views["report"]:
         progress("writing the report", 0, 0)
-        updates = None if run.trace is None else run.trace.updates
-        write_report(folder / "report.html", withheld=run.withheld, updates=updates, **common)
-
-
-def plain(value: Any) -> Any:
-    """Plain JSON types: no NumPy scalar, and null for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
+        write_report(
+            folder / "report.html",
+            session=session,
+            solution=run.solution,
+            summary=summary,
+            evaluation=evaluation,
+            causal=run.causal,
+            withheld=run.withheld,
+            updates=updates,
+        )
 
 
 def read_run(path: str | Path) -> StoredRun:
@@ -259,15 +271,8 @@ def read_run(path: str | Path) -> StoredRun:
         found = f"holds no {SUMMARY}" if path.is_dir() else "is no folder"
         raise SessionError(path, found, "a run folder", "make one with `smartnav smooth`")
     try:
-        summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-        session = summary["session"]
-        origin = session["origin"]
-        key = {
-            "t0_ns": int(session["t0_ns"]),
-            "origin": None if origin is None else Origin(**origin),
-            "forward": session["forward"],
-            "up": session["up"],
-        }
+        summary: dict[str, object] = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
+        frame = _Frame.of(table_of(summary, "session"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(
             path / SUMMARY, f"cannot be read ({error!r})", "the summary of a run", "smooth the session again"
@@ -275,15 +280,38 @@ def read_run(path: str | Path) -> StoredRun:
     causal = path / "causal.parquet"
     return StoredRun(
         path=path,
-        solution=_read_states(path / "solution.parquet", key, _read_residuals(path / "residuals.parquet")),
+        solution=_read_states(path / "solution.parquet", frame, _read_residuals(path / "residuals.parquet")),
         summary=summary,
-        causal=_read_states(causal, key) if causal.is_file() else None,
+        causal=_read_states(causal, frame) if causal.is_file() else None,
     )
 
 
-def _read_states(path: Path, key: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:
+@dataclass(frozen=True)
+class _Frame:
+    """What a solution needs of the session it was estimated from."""
+
+    t0_ns: int
+    origin: Origin | None
+    forward: str
+    up: str
+
+    @classmethod
+    def of(cls, session: Mapping[str, Any]) -> _Frame:
+        origin = session["origin"]
+        origin = None if origin is None else Origin(**origin)
+        return cls(int(session["t0_ns"]), origin, str(session["forward"]), str(session["up"]))
+
+
+def _read_states(path: Path, frame: _Frame, residuals: Residuals | None = None) -> Solution:
     try:
-        return solution_model.from_columns(solution_model.read(path), residuals=residuals, **key)
+        return solution_model.from_columns(
+            solution_model.read(path),
+            residuals=residuals,
+            t0_ns=frame.t0_ns,
+            origin=frame.origin,
+            forward=frame.forward,
+            up=frame.up,
+        )
     except (OSError, KeyError, pa.ArrowException) as error:
         raise _unreadable(path, error) from error
 
@@ -301,12 +329,12 @@ def _unreadable(path: Path, error: Exception) -> SessionError:
     return SessionError(path, f"cannot be read ({error})", "a table of a run", "smooth the session again")
 
 
-def config_differences(first: str | Path, second: str | Path) -> dict[str, tuple[Any, Any]]:
-    """Options that two runs have not in common: ``section.field`` -> the value of each, None where it is not set."""
+def config_differences(first: str | Path, second: str | Path) -> dict[str, tuple[object, object]]:
+    """Options that differ between two runs: ``section.field`` -> both values, None where it is not set."""
 
-    def flat(path: str | Path) -> dict[str, Any]:
+    def flat(path: str | Path) -> dict[str, object]:
         table = dataclasses.asdict(config_model.load(Path(path) / "config.toml"))
-        return {f"{room}.{name}": value for room, fields in table.items() for name, value in fields.items()}
+        return {f"{section}.{name}": value for section, fields in table.items() for name, value in fields.items()}
 
     one, other = flat(first), flat(second)
     return {key: (one[key], other[key]) for key in one if one[key] != other[key]}

@@ -31,23 +31,11 @@ def axes(template: str, names: str = "xyz", *, optional: bool = False, nan: bool
 
 
 class Label(NamedTuple):
-    """Words and colour of a stream or a factor for people.
-
-    title : of a sensor in tables; one, many : of its rows; source : in a sentence, ``the <many>`` where it is empty;
-    assumes : what it means, where no sensor measured it; colour : red, green, blue
-    """
+    """Title and colour (red, green, blue) of a stream or a factor; `assumes` : meaning of a factor without a sensor."""
 
     title: str
-    one: str
-    many: str
-    source: str = ""
     assumes: str = ""
     colour: tuple[int, int, int] = (190, 130, 255)
-
-    @property
-    def as_source(self) -> str:
-        """``the GNSS fixes``."""
-        return self.source or f"the {self.many}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ class Imu(Stream):
     """Angular rate `gyro` (n, 3) rad/s and specific force `accel` (n, 3) m/s^2 in body axes."""
 
     NAME: ClassVar[str] = "imu"
-    LABEL: ClassVar[Label] = Label("IMU", "IMU sample", "IMU samples", "the inertial data", colour=(235, 80, 80))
+    LABEL: ClassVar[Label] = Label("IMU", colour=(235, 80, 80))
 
     gyro: Floats = axes("gyro_{}_rad_s")
     accel: Floats = axes("accel_{}_m_s2")
@@ -28,7 +28,7 @@ class GnssFix(Positioned):
     """Position fixes with 1-sigma (n, 3) m; optional velocity (n, 3) m/s in nav axes."""
 
     NAME: ClassVar[str] = "gnss"
-    LABEL: ClassVar[Label] = Label("GNSS", "GNSS fix", "GNSS fixes", colour=(80, 200, 120))
+    LABEL: ClassVar[Label] = Label("GNSS", colour=(80, 200, 120))
 
     velocity: Floats | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
     sigma_velocity: Floats | None = quantity("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
@@ -40,7 +40,7 @@ class ControlPoint(Positioned):
     """Surveyed points at which the sensor head was placed."""
 
     NAME: ClassVar[str] = "control"
-    LABEL: ClassVar[Label] = Label("Control points", "control point", "control points", colour=(255, 130, 200))
+    LABEL: ClassVar[Label] = Label("Control points", colour=(255, 130, 200))
 
     point_id: Texts = quantity("point_id", kind="text")
     sensor: Texts | None = quantity("sensor", optional=True, kind="text")
@@ -51,7 +51,7 @@ class PoseFix(Positioned):
     """Position or pose fixes from elsewhere (image recognition, total station); `quat` (n, 4) w x y z of nav_R_body."""
 
     NAME: ClassVar[str] = "pose_fixes"
-    LABEL: ClassVar[Label] = Label("Pose fixes", "pose fix", "pose fixes", colour=(60, 210, 210))
+    LABEL: ClassVar[Label] = Label("Pose fixes", colour=(60, 210, 210))
     UNIQUE_TIMES: ClassVar[bool] = False
 
     quat: Floats | None = quantity("qw", "qx", "qy", "qz", optional=True, nan=True)
@@ -65,7 +65,7 @@ class Ranges(Located):
     row is that of its anchor."""
 
     NAME: ClassVar[str] = "ranges"
-    LABEL: ClassVar[Label] = Label("Ranges", "range", "ranges", colour=(150, 220, 90))
+    LABEL: ClassVar[Label] = Label("Ranges", colour=(150, 220, 90))
     UNIQUE_TIMES: ClassVar[bool] = False
 
     anchor_id: Texts = quantity("anchor_id", kind="text")
@@ -91,7 +91,7 @@ class StaticPeriod(Stream):
     """Listed standstills: from t_ns to t_end_ns, residual speed sigma m/s."""
 
     NAME: ClassVar[str] = "static"
-    LABEL: ClassVar[Label] = Label("Standstills", "standstill", "standstills")
+    LABEL: ClassVar[Label] = Label("Standstills")
     AIDING: ClassVar[bool] = True
 
     t_end_ns: Times = quantity("t_end_ns", kind="int")
@@ -104,7 +104,7 @@ class Magnetometer(Stream):
     """Magnetic flux density (n, 3) uT, body axes."""
 
     NAME: ClassVar[str] = "magnetometer"
-    LABEL: ClassVar[Label] = Label("Magnetometer", "magnetometer sample", "magnetometer samples", "the magnetometer")
+    LABEL: ClassVar[Label] = Label("Magnetometer")
     AIDING: ClassVar[bool] = True
 
     field_ut: Floats = axes("mag_{}_ut")
@@ -115,7 +115,7 @@ class Barometer(Stream):
     """Air pressure (n,) hPa."""
 
     NAME: ClassVar[str] = "barometer"
-    LABEL: ClassVar[Label] = Label("Barometer", "pressure sample", "pressure samples", "the barometer")
+    LABEL: ClassVar[Label] = Label("Barometer")
     AIDING: ClassVar[bool] = True
 
     pressure_hpa: Floats = quantity("pressure_hpa")
@@ -126,7 +126,7 @@ class Temperature(Stream):
     """Sensor temperature (n,) deg C."""
 
     NAME: ClassVar[str] = "temperature"
-    LABEL: ClassVar[Label] = Label("Temperature", "temperature sample", "temperature samples")
+    LABEL: ClassVar[Label] = Label("Temperature")
 
     temperature_c: Floats = quantity("temperature_c")
 
@@ -136,7 +136,7 @@ class Velocity(Stream):
     """Velocity (n, 3) m/s in body axes."""
 
     NAME: ClassVar[str] = "velocity"
-    LABEL: ClassVar[Label] = Label("Velocity", "velocity", "velocities", "the measured velocities")
+    LABEL: ClassVar[Label] = Label("Velocity")
     AIDING: ClassVar[bool] = True
 
     velocity: Floats = axes("v_{}_m_s")
@@ -148,7 +148,7 @@ class WheelSpeed(Stream):
     """Wheel speed (n,) m/s along the vehicle's forward axis."""
 
     NAME: ClassVar[str] = "wheel"
-    LABEL: ClassVar[Label] = Label("Wheel speed", "wheel speed", "wheel speeds", "the wheel")
+    LABEL: ClassVar[Label] = Label("Wheel speed")
     AIDING: ClassVar[bool] = True
 
     speed: Floats = quantity("speed_m_s")
@@ -160,7 +160,7 @@ class Images(Stream):
     """One row per image; files lie in the session's images/ folder."""
 
     NAME: ClassVar[str] = "images"
-    LABEL: ClassVar[Label] = Label("Images", "image", "images")
+    LABEL: ClassVar[Label] = Label("Images")
     UNIQUE_TIMES: ClassVar[bool] = False
 
     image_id: Times = quantity("image_id", kind="int")
@@ -175,7 +175,7 @@ class Tracks(Stream):
     """Feature observations; `xy_n` (n, 2) undistorted normalised image coordinates."""
 
     NAME: ClassVar[str] = "tracks"
-    LABEL: ClassVar[Label] = Label("Tracked points", "tracked point", "tracked points")
+    LABEL: ClassVar[Label] = Label("Tracked points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
     image_id: Times = quantity("image_id", kind="int")
@@ -189,7 +189,7 @@ class Matches(Stream):
     """Matched points of two images; normalised coordinates (n, 2) each."""
 
     NAME: ClassVar[str] = "matches"
-    LABEL: ClassVar[Label] = Label("Matched points", "matched point", "matched points")
+    LABEL: ClassVar[Label] = Label("Matched points")
     UNIQUE_TIMES: ClassVar[bool] = False
 
     image_id_0: Times = quantity("image_id_0", kind="int")
@@ -205,7 +205,7 @@ class Reference(Stream):
     """A reference trajectory in nav: position m, and where known attitude, velocity, biases and sigmas."""
 
     NAME: ClassVar[str] = "reference"
-    LABEL: ClassVar[Label] = Label("Reference", "reference position", "reference positions")
+    LABEL: ClassVar[Label] = Label("Reference")
 
     enu: Floats = quantity(*ENU)
     quat: Floats | None = quantity("qw", "qx", "qy", "qz", optional=True)

@@ -1,13 +1,11 @@
-"""What determined the state at one instant: which measurements, how much, what is near; in figures and in words.
+"""Which measurements determine the state at one epoch, and how much; what lies near it; in figures and in sentences.
 
-The state is that of the nearest keyframe, given all data; its figures are those of `influence`.
+The state is that of the nearest keyframe, given all data; the figures are those of `evaluation.influence`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +16,7 @@ from smartnav_graph.evaluation.influence import FACTORS, KEYFRAMES, Influence, i
 from smartnav_graph.graph.solution import POS
 from smartnav_graph.output.explain.figures import Explanation
 from smartnav_graph.output.explain.nearby import Nearby, nearby
-from smartnav_graph.output.explain.words import sentences, table
+from smartnav_graph.output.explain.sentences import sentences, table
 from smartnav_graph.output.run_folder import StoredRun
 
 __all__ = ["Explained", "Explanation", "explain"]
@@ -32,41 +30,40 @@ class Explained:
     near: Nearby
     sentences: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """All of it as plain values."""
-        near: Mapping[str, Any] = asdict(self.near)
-        return {**self.figures.to_dict(), "near": near, "sentences": list(self.sentences)}
+        return {**self.figures.to_dict(), "near": asdict(self.near), "sentences": list(self.sentences)}
 
     def to_text(self) -> str:
-        """The sentences, and tables under them."""
+        """The sentences, then tables."""
         return "\n".join(self.sentences) + "\n" + table(self.figures)
 
 
 def explain(run: StoredRun, at_s: float | None = None) -> Explained:
-    """What determined the state of a run `at_s` seconds after time zero; by default where it is least certain.
+    """What determines the state of a run `at_s` seconds after time zero; by default at the largest horizontal sigma.
 
     Raises
     ------
     ConfigError
-        The run does not reach there.
+        `at_s` is outside the run.
     SessionError
-        The run's folder lacks what an explanation needs.
+        The run's folder lacks the stored linear system.
     SolverError
-        The stored system determines nothing there.
+        The stored system does not determine that keyframe.
     """
     influence = _read(run)
     asked = None if at_s is None else _checked(run, at_s)
     place = influence.keyframes.nearest(_least_certain(run) if asked is None else asked)
     figures = Explanation(run, influence, influence_of_keyframe(influence, place), asked)
-    near = nearby(run, figures.held.measurements, figures.seconds(figures.t_ns))
+    near = nearby(run, figures.keyframe.measurements, figures.seconds(figures.t_ns))
     return Explained(figures, near, tuple(sentences(figures, near)))
 
 
 def _read(run: StoredRun) -> Influence:
-    """The linear system that a run left in its folder."""
+    """The linear system stored with a run."""
     for name in (FACTORS, KEYFRAMES):
         if not (run.path / name).is_file():
-            raise SessionError(run.path, f"holds no {name}", "a run that can be explained", "smooth the session again")
+            raise SessionError(run.path, f"holds no {name}", "a run with its linear system", "smooth the session again")
     try:
         return Influence.read(run.path)
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
@@ -77,11 +74,11 @@ def _read(run: StoredRun) -> Influence:
 
 
 def _checked(run: StoredRun, at_s: float) -> int:
-    """Stamp of an instant inside the run."""
+    """Stamp of a time inside the run."""
     seconds = run.solution.seconds
     if not seconds[0] <= at_s <= seconds[-1]:
-        reach = f"{seconds[0]:.3f} to {seconds[-1]:.3f} s, where the run is"
-        raise ConfigError("--at", f"{at_s:g} s", reach, "seconds count from the session's start")
+        inside = f"{seconds[0]:.3f} to {seconds[-1]:.3f} s, the time span of the run"
+        raise ConfigError("--at", f"{at_s:g} s", inside, "seconds count from the session's start")
     return int(run.solution.t0_ns + ns_from_seconds(at_s))
 
 

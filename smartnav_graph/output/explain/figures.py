@@ -1,9 +1,9 @@
-"""What determined the state of one keyframe, in the quantities that people speak of."""
+"""What determines the state of one keyframe: position, heading, tilt, velocity, biases."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,19 +13,19 @@ from smartnav_graph.evaluation.influence import CALIBRATION, Influence, Keyframe
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, VEL
 from smartnav_graph.output.run_folder import StoredRun
 
-# About the vertical, among the fifteen components.
-HEADING = 2
-# A sigma that grows by this factor without a source rests on it.
-RESTS = 10.0
-# Sigmas that the pulls of a graph solved as one may miss to balance.
+# Rotation about the vertical, among the fifteen components.
+YAW = 2
+# A quantity depends on a source without which its sigma grows by more than this factor.
+DEPENDS = 10.0
+# The shifts of all sources add up to zero in a graph that was solved as a whole, to so many sigmas.
 UNBALANCED = 0.05
-STRONGEST = 5  # measurements told one by one
-# Sources that no single row of a sensor stands for.
+STRONGEST = 5  # measurements listed one by one
+# Sources without single rows of a sensor.
 NO_ROWS = ("imu", "prior", CALIBRATION)
 
 
 class Quantity(NamedTuple):
-    """Components of the state that people speak of as one, and the factor to its unit."""
+    """Components of the state that are reported together, and the factor to its unit."""
 
     name: str
     components: slice
@@ -44,39 +44,41 @@ QUANTITIES = (
     Quantity("accelerometer bias", ACCEL_BIAS, "m/s²"),
     Quantity("gyroscope bias", GYRO_BIAS, "deg/s", DEG),
 )
-PLACE, LEVEL_PLACE = Quantity("position", POS, "m"), Quantity("position", slice(3, 5), "m")
-HEIGHT, DIRECTION, TILT, VELOCITY = QUANTITIES[2:6]
+POSITION, HORIZONTAL = Quantity("position", POS, "m"), Quantity("position", slice(3, 5), "m")
+UP, HEADING, TILT, VELOCITY = QUANTITIES[2:6]
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why the state of one keyframe is what it is.
+    """What determines the state of one keyframe.
 
-    asked_ns : the instant asked for, None where the least certain one was looked for
+    asked_ns : the requested time, None for the largest horizontal sigma
     """
 
     run: StoredRun
     influence: Influence
-    held: KeyframeInfluence
+    keyframe: KeyframeInfluence
     asked_ns: int | None
 
     @property
     def t_ns(self) -> int:
-        return int(self.influence.keyframes.t_ns[self.held.place])
+        return int(self.influence.keyframes.t_ns[self.keyframe.place])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Every figure."""
-        frames, place = self.influence.keyframes, self.held.place
+        frames, place = self.influence.keyframes, self.keyframe.place
         return {
             "asked_s": None if self.asked_ns is None else self.seconds(self.asked_ns),
             "t_s": self.seconds(self.t_ns),
             "keyframe": {"number": place + 1, "of": len(frames), "window": str(frames.kind[place])},
             "components": [self._component(quantity) for quantity in QUANTITIES],
-            "pull_sigmas": {name: pulls(pull) for name, pull in zip(self.held.sources, self.held.pull, strict=True)},
+            "shift_sigmas": {
+                name: shifts(shift) for name, shift in zip(self.keyframe.sources, self.keyframe.pull, strict=True)
+            },
             "balanced": self.balanced,
             "touching": self._touching(),
             "measurements": [self._measurement(i) for i in self.strongest()],
-            "reach_s": {q.name: self.reach_s(q) for q in (PLACE, DIRECTION)},
+            "half_within_s": {q.name: self.half_within_s(q) for q in (POSITION, HEADING)},
         }
 
     def seconds(self, t_ns: int) -> float:
@@ -85,84 +87,85 @@ class Explanation:
 
     @property
     def balanced(self) -> bool:
-        """Whether the pulls balance: the graph was solved as one."""
-        return bool(np.abs(self.held.pull.sum(axis=0)).max() < UNBALANCED)
+        """Whether the shifts add up to zero: the graph was solved as a whole."""
+        return bool(np.abs(self.keyframe.pull.sum(axis=0)).max() < UNBALANCED)
 
     def share(self, quantity: Quantity) -> Floats:
         """Share (s,) of each source in the variance of a quantity."""
-        return self._mean(self.held.share, quantity)
+        return self._mean(self.keyframe.share, quantity)
 
-    def here(self, quantity: Quantity) -> float:
-        """Share of what touches this keyframe and no other."""
-        return float(self._mean(self.held.here, quantity).sum())
+    def measured_at_epoch(self, quantity: Quantity) -> float:
+        """Share of the factors that touch this keyframe and no other."""
+        return float(self._mean(self.keyframe.here, quantity).sum())
 
     def _mean(self, by_component: Floats, quantity: Quantity) -> Floats:
-        part, variance = quantity.components, self.held.sigma[quantity.components] ** 2
+        part, variance = quantity.components, self.keyframe.sigma[quantity.components] ** 2
         return np.asarray(by_component[:, part] @ variance / variance.sum())
 
     def without(self, quantity: Quantity) -> Floats:
-        """Factor (s,) on the sigma of a quantity without each source, inf where nothing determines it then."""
-        part, variance = quantity.components, self.held.sigma[quantity.components] ** 2
-        return np.asarray(np.sqrt(self.held.without[:, part] ** 2 @ variance / variance.sum()))
+        """Factor (s,) on the sigma of a quantity without each source, inf where it is not observable then."""
+        part, variance = quantity.components, self.keyframe.sigma[quantity.components] ** 2
+        return np.asarray(np.sqrt(self.keyframe.without[:, part] ** 2 @ variance / variance.sum()))
 
     def sigma(self, quantity: Quantity) -> float:
         """Sigma of a quantity in its unit: of several components the root of the sum of squares."""
-        return float(np.linalg.norm(self.held.sigma[quantity.components])) * quantity.factor
+        return float(np.linalg.norm(self.keyframe.sigma[quantity.components])) * quantity.factor
 
-    def reach_s(self, quantity: Quantity) -> float:
-        """Seconds around the instant within which lies half of what the quantity's variance is made of."""
-        share = self._mean(self.held.measurements.share, quantity)
-        away = np.abs(self.held.measurements.t_ns - self.t_ns)
+    def half_within_s(self, quantity: Quantity) -> float:
+        """Seconds before and after the epoch from which half of the quantity's variance comes."""
+        share = self._mean(self.keyframe.measurements.share, quantity)
+        away = np.abs(self.keyframe.measurements.t_ns - self.t_ns)
         order = np.argsort(away, kind="stable")
         half = int(np.searchsorted(np.cumsum(share[order]), 0.5 * share.sum()))
         return round(float(away[order[min(half, len(order) - 1)]]) / NS, 3)
 
     def strongest(self) -> list[int]:
-        """Measurements that pull the position or the heading most, none of the inertial ones."""
-        told = self.held.measurements
-        pull = np.abs(told.pull[:, [3, 4, 5, HEADING]]).max(axis=1)
-        pull[np.isin(told.source, NO_ROWS)] = 0.0
-        order = np.argsort(-pull, kind="stable")[:STRONGEST]
-        return [int(i) for i in order if pull[i] > 0.0]
+        """Measurements that shift the position or the heading most, without the inertial ones."""
+        all_rows = self.keyframe.measurements
+        shift = np.abs(all_rows.pull[:, [3, 4, 5, YAW]]).max(axis=1)
+        shift[np.isin(all_rows.source, NO_ROWS)] = 0.0
+        order = np.argsort(-shift, kind="stable")[:STRONGEST]
+        return [int(i) for i in order if shift[i] > 0.0]
 
-    def _component(self, quantity: Quantity) -> dict[str, Any]:
-        names, without = self.held.sources, self.without(quantity)
+    def _component(self, quantity: Quantity) -> dict[str, object]:
+        names, without = self.keyframe.sources, self.without(quantity)
         return {
             "name": quantity.name,
             "unit": quantity.unit,
             "sigma": self.sigma(quantity),
             "share": dict(zip(names, self.share(quantity).tolist(), strict=True)),
-            "measured_here": self.here(quantity),
+            "share_at_epoch": self.measured_at_epoch(quantity),
             "sigma_factor_without": {n: finite(f) for n, f in zip(names, without, strict=True)},
-            "rests_on": [n for n, f in zip(names, without, strict=True) if f > RESTS],
+            "depends_on": [n for n, f in zip(names, without, strict=True) if f > DEPENDS],
         }
 
-    def _touching(self) -> list[dict[str, Any]]:
-        found, h = [], self.held
+    def _touching(self) -> list[dict[str, object]]:
+        found: list[dict[str, object]] = []
+        h = self.keyframe
         for i in np.flatnonzero(h.touching).tolist():
             own = {q.name: float(np.linalg.norm(h.own[i, q.components])) * q.factor for q in QUANTITIES}
-            told = {"source": h.sources[i], "factors": int(h.touching[i]), "pull_sigmas": pulls(h.pull_here[i])}
-            found.append(told | {"sigma_if_neighbours_were_known": {n: finite(s) for n, s in own.items()}})
+            row = {"source": h.sources[i], "factors": int(h.touching[i]), "shift_sigmas": shifts(h.pull_here[i])}
+            found.append(row | {"sigma_if_neighbours_were_known": {n: finite(s) for n, s in own.items()}})
         return found
 
-    def _measurement(self, i: int) -> dict[str, Any]:
-        m = self.held.measurements
+    def _measurement(self, i: int) -> dict[str, object]:
+        m = self.keyframe.measurements
         return {
             "source": str(m.source[i]),
             "t_s": self.seconds(int(m.t_ns[i])),
             "row": int(m.row[i]),
-            "share_of_position": float(self._mean(m.share[i : i + 1], PLACE)[0]),
-            "share_of_heading": float(m.share[i, HEADING]),
-            "pull_sigmas": pulls(m.pull[i]),
+            "share_of_position": float(self._mean(m.share[i : i + 1], POSITION)[0]),
+            "share_of_heading": float(m.share[i, YAW]),
+            "shift_sigmas": shifts(m.pull[i]),
         }
 
 
-def pulls(sigmas: Floats) -> dict[str, float]:
-    """A pull (15,) in the directions that people speak of."""
-    told = {"east": sigmas[3], "north": sigmas[4], "up": sigmas[5], "heading_clockwise": -sigmas[HEADING]}
-    return {name: float(value) for name, value in told.items()}
+def shifts(sigmas: Floats) -> dict[str, float]:
+    """A shift (15,) in sigmas by direction."""
+    named = {"east": sigmas[3], "north": sigmas[4], "up": sigmas[5], "heading_clockwise": -sigmas[YAW]}
+    return {name: float(value) for name, value in named.items()}
 
 
 def finite(value: float) -> float | None:
-    """A number, None for what has no bound."""
+    """A number, None where it is infinite."""
     return float(value) if np.isfinite(value) else None

@@ -1,22 +1,20 @@
-"""What lies around an instant: gaps, rejections, standstills, the measurements in use."""
+"""What lies near an epoch: gaps, rejections, standstills, measurements in use."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import seconds_since
 from smartnav_graph.evaluation.influence import CALIBRATION, Measurements
 from smartnav_graph.output.run_folder import StoredRun
+from smartnav_graph.output.summary_json import Summary, as_float, imu_gaps, rows_of, standstill_spans, text_of
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A stretch of time: start and length in s; away_s: from the instant, negative before it, zero inside."""
+class Span:
+    """A time span: start and length in s; away_s: from the epoch to it, negative if it is earlier, zero inside."""
 
     start_s: float
     length_s: float
@@ -25,7 +23,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Around:
+class Neighbours:
     """Measurements of one source in use: seconds to the last one before (or at) the instant and to the next one after,
     None where there is none."""
 
@@ -34,40 +32,56 @@ class Around:
 
 
 @dataclass(frozen=True)
-class Nearby:
-    """The nearest of each kind, None where the run has none; rejection: a row of `rejections` with `away_s`."""
+class Rejection:
+    """One rejected measurement: time and distance in time to the epoch, s; size in sigmas and, where known, in m."""
 
-    gap: Stretch | None
-    standstill: Stretch | None
-    rejection: Mapping[str, Any] | None
-    used: Mapping[str, Around]
+    sensor: str
+    t_s: float
+    away_s: float
+    size_sigma: float | None
+    size_m: float | None
+
+    @classmethod
+    def of(cls, row: Summary, t_s: float) -> Rejection:
+        """A row of the `rejections` of a summary, seen from `t_s`."""
+        at = as_float(row.get("t_s")) or 0.0
+        sizes = (as_float(row.get(name)) for name in ("size_sigma", "size_m"))
+        return cls(text_of(row, "sensor"), at, round(at - t_s, 4), *sizes)
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """The nearest of each kind, None where the run has none; used: by source."""
+
+    gap: Span | None
+    standstill: Span | None
+    rejection: Rejection | None
+    used: Mapping[str, Neighbours]
 
 
 def nearby(run: StoredRun, measurements: Measurements, t_s: float) -> Nearby:
     """Around `t_s` seconds after time zero."""
-    told = run.summary
-    gaps = [(gap["start_s"], gap["length_s"], str(gap["kind"])) for gap in told.get("gaps", ())]
-    rests = [(a, b - a, "standstill") for a, b in told.get("standstills", {}).get("spans_s", ())]
-    rejected = [dict(one) | {"away_s": round(one["t_s"] - t_s, 4)} for one in told.get("rejections", ())]
+    standstills = [(start, end - start, "standstill") for start, end in standstill_spans(run.summary)]
+    rejected = [Rejection.of(row, t_s) for row in rows_of(run.summary, "rejections")]
     seconds = seconds_since(measurements.t_ns, run.solution.t0_ns)
     names = sorted({str(name) for name in measurements.source} - {"imu", "prior", CALIBRATION})
     return Nearby(
-        gap=_nearest(gaps, t_s),
-        standstill=_nearest(rests, t_s),
-        rejection=min(rejected, key=lambda one: abs(one["away_s"]), default=None),
-        used={name: _around(seconds[measurements.source == name], t_s) for name in names},
+        gap=_nearest(imu_gaps(run.summary), t_s),
+        standstill=_nearest(standstills, t_s),
+        rejection=min(rejected, key=lambda one: abs(one.away_s), default=None),
+        used={name: _neighbours(seconds[measurements.source == name], t_s) for name in names},
     )
 
 
-def _nearest(spans: Sequence[tuple[float, float, str]], t_s: float) -> Stretch | None:
+def _nearest(spans: Sequence[tuple[float, float, str]], t_s: float) -> Span | None:
     found = [
-        Stretch(start, length, round(max(start - t_s, 0.0) - max(t_s - start - length, 0.0), 4), kind)
+        Span(start, length, round(max(start - t_s, 0.0) - max(t_s - start - length, 0.0), 4), kind)
         for start, length, kind in spans
     ]
     return min(found, key=lambda one: abs(one.away_s), default=None)
 
 
-def _around(seconds: NDArray[np.float64], t_s: float) -> Around:
+def _neighbours(seconds: Floats, t_s: float) -> Neighbours:
     before, after = t_s - seconds[seconds <= t_s + 1e-6], seconds[seconds > t_s + 1e-6] - t_s
     nearest = [round(max(float(side.min()), 0.0), 4) if len(side) else None for side in (before, after)]
-    return Around(*nearest)
+    return Neighbours(*nearest)

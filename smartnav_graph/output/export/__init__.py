@@ -1,8 +1,8 @@
-"""A solution in the formats of other programs: TUM, KML, GeoJSON, GPX, CSV, and the pictures with their place.
+"""A solution in the formats of other programs: TUM, KML, GeoJSON, GPX, CSV, and images with their position.
 
 Geographic formats need an origin. Their times are absolute only where the clock counts from the Unix epoch; otherwise
-the files carry seconds since time zero, and their description says so. Heights are ellipsoidal (WGS84), and that is
-told too, since KML and GPX programs take them for heights above sea level.
+the files have seconds since time zero. Their description says so, and that heights are ellipsoidal (WGS84): KML and
+GPX programs take them for heights above sea level.
 """
 
 from __future__ import annotations

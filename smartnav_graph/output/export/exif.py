@@ -1,4 +1,4 @@
-"""EXIF beside the pixels of a picture: a copy of a JPEG or PNG file with other EXIF data and every other byte the same.
+"""Replace the EXIF data of a JPEG or PNG file; every other byte stays the same.
 
 Sources: CIPA DC-008-2023 (Exif 3.0), ch. 4.5.4 and 4.7 (JPEG), W3C Portable Network Graphics 3rd ed., 11.3.2.9 (eXIf).
 """
@@ -20,7 +20,7 @@ def with_exif(picture: bytes, tiff: bytes) -> bytes:
     Raises
     ------
     ValueError
-        It is neither, is cut short, or the EXIF does not fit.
+        The file is neither, is truncated, or the EXIF does not fit.
     """
     try:
         if picture.startswith(JPEG):
@@ -28,12 +28,12 @@ def with_exif(picture: bytes, tiff: bytes) -> bytes:
         if picture.startswith(PNG):
             return _png(picture, tiff)
     except (struct.error, IndexError) as error:
-        raise ValueError("is cut short") from error
+        raise ValueError("is truncated") from error
     raise ValueError("is neither JPEG nor PNG")
 
 
 def _jpeg(picture: bytes, exif: bytes) -> bytes:
-    """Segments up to the first scan: the new EXIF stands first, behind a JFIF header where there is one."""
+    """Segments up to the first scan: the new EXIF comes first, or after a JFIF header."""
     if len(exif) > LONGEST:
         raise ValueError(f"has {len(exif)} bytes of EXIF, more than a JPEG holds")
     segments, at = list[tuple[int, bytes]](), 2
@@ -41,7 +41,7 @@ def _jpeg(picture: bytes, exif: bytes) -> bytes:
         length = struct.unpack_from(">H", picture, at + 2)[0]
         segment = picture[at : at + 2 + length]
         if picture[at] != 0xFF or len(segment) != 2 + length:
-            raise ValueError("is no sound JPEG")
+            raise ValueError("is a damaged JPEG")
         if not (segment[1] == APP1 and segment[4:].startswith(HEADER)):
             segments.append((segment[1], segment))
         at += len(segment)
@@ -52,13 +52,13 @@ def _jpeg(picture: bytes, exif: bytes) -> bytes:
 
 
 def _png(picture: bytes, tiff: bytes) -> bytes:
-    """Chunks: the new eXIf stands right behind the header."""
+    """Chunks: the new eXIf follows the header."""
     chunks, at = list[bytes](), len(PNG)
     while at < len(picture):
         length, kind = struct.unpack_from(">I4s", picture, at)
         chunk = picture[at : at + 12 + length]
         if len(chunk) != 12 + length:
-            raise ValueError("is cut short")
+            raise ValueError("is truncated")
         if kind != b"eXIf":
             chunks.append(chunk)
         at += len(chunk)

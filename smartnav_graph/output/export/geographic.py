@@ -6,15 +6,14 @@ Sources: OGC 12-007r2 KML 2.3 (gx:Track); TopoGrafix, GPX 1.1 schema; RFC 7946 (
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.graph.solution import POS, Solution
 
@@ -23,9 +22,9 @@ Rows = list[list[float]]
 KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
 GX_NAMESPACE = "http://www.google.com/kml/ext/2.2"
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
-OWN_NAMESPACE = "urn:smartnav-graph:trajectory"  # of what GPX itself has no element for
+OWN_NAMESPACE = "urn:smartnav-graph:trajectory"  # of sigmas, for which GPX has no element
 ORANGE = "ff0045ff"  # opacity, blue, green, red
-MARKS = 100  # points of a KML track that are told one by one
+MARKS = 100  # single points of a KML track
 SIGMAS = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
 
 
@@ -36,8 +35,8 @@ def _add(parent: Element, space: str, tag: str, text: str | None = None, **attri
 
 
 def write_kml(solution: Solution, path: str | Path, absolute_time: bool) -> None:
-    """A gx:Track with a time and one-sigma arrays a point, without absolute time a line; and about `MARKS` points along
-    it that tell their time, one sigma and heading by themselves."""
+    """A gx:Track with times and one-sigma arrays, without absolute time a line; and about `MARKS` points along it with
+    time, one sigma and heading."""
     ElementTree.register_namespace("", KML_NAMESPACE)
     ElementTree.register_namespace("gx", GX_NAMESPACE)
     root = Element(f"{{{KML_NAMESPACE}}}kml")
@@ -95,7 +94,7 @@ def _kml_track(placemark: Element, solution: Solution, coordinates: Rows) -> Non
 
 
 def _kml_marks(document: Element, solution: Solution, coordinates: Rows, absolute_time: bool) -> None:
-    """Points evenly along the epochs, in a folder of their own."""
+    """Points at equal steps of the epochs, in a separate folder."""
     folder = _add(document, KML_NAMESPACE, "Folder")
     _add(folder, KML_NAMESPACE, "name", "epochs")
     columns = {"elapsed_s": solution.seconds.tolist(), **_sigmas(solution)}
@@ -114,7 +113,7 @@ def _kml_marks(document: Element, solution: Solution, coordinates: Rows, absolut
 
 
 def write_gpx(solution: Solution, path: str | Path, absolute_time: bool) -> None:
-    """One GPX 1.1 track; points carry a time where it is absolute, and their sigmas as extensions."""
+    """One GPX 1.1 track; points have a time where it is absolute, and their sigmas as extensions."""
     ElementTree.register_namespace("", GPX_NAMESPACE)
     ElementTree.register_namespace("smartnav", OWN_NAMESPACE)
     root = Element(f"{{{GPX_NAMESPACE}}}gpx", version="1.1", creator="smartnav_graph")
@@ -139,7 +138,7 @@ def write_gpx(solution: Solution, path: str | Path, absolute_time: bool) -> None
 def write_geojson(solution: Solution, path: str | Path, absolute_time: bool) -> None:
     """A FeatureCollection: the line, then every epoch as a point with its time, one sigma and heading."""
     coordinates = lla_of(solution)[:, [1, 0, 2]].tolist()
-    columns: dict[str, list[Any]] = {
+    columns: dict[str, Sequence[object]] = {
         "t_ns": solution.t_ns.tolist(),
         "elapsed_s": solution.seconds.tolist(),
         **_sigmas(solution),
@@ -147,7 +146,7 @@ def write_geojson(solution: Solution, path: str | Path, absolute_time: bool) -> 
     }
     if absolute_time:
         columns["time"] = utc(solution.t_ns)
-    about = {"name": "trajectory", "description": _description(solution, absolute_time)}
+    about: dict[str, object] = {"name": "trajectory", "description": _description(solution, absolute_time)}
     features = [_feature("LineString", coordinates, about)]
     for place, *row in zip(coordinates, *columns.values(), strict=True):
         features.append(_feature("Point", place, dict(zip(columns, row, strict=True))))
@@ -155,18 +154,18 @@ def write_geojson(solution: Solution, path: str | Path, absolute_time: bool) -> 
         json.dump({"type": "FeatureCollection", "features": features}, file, allow_nan=False)
 
 
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+def _feature(kind: str, coordinates: object, properties: dict[str, object]) -> dict[str, object]:
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 
 def lla_of(solution: Solution) -> Floats:
     """Latitude deg, longitude deg, ellipsoidal height m (n, 3) of a solution that has an origin."""
-    assert solution.origin is not None  # asked for before
+    assert solution.origin is not None  # checked by `export`
     return LocalFrame(solution.origin).lla_from_nav(solution.nav_t_body)
 
 
-def utc(t_ns: NDArray[np.int64]) -> list[str]:
-    """ISO 8601 in UTC of Unix nanoseconds, cut to the microsecond (what other programs read)."""
+def utc(t_ns: Times) -> list[str]:
+    """ISO 8601 in UTC of Unix nanoseconds, truncated to microseconds (which other programs read)."""
     text: list[str] = np.datetime_as_string(t_ns.astype("datetime64[ns]"), unit="us").tolist()
     return [f"{t}Z" for t in text]
 

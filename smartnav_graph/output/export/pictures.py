@@ -1,13 +1,13 @@
-"""Copies of a session's pictures that tell in their EXIF where they were taken, which way, when and how surely.
+"""Copies of a session's images with position, direction, time and one sigma in their EXIF.
 
-The camera is where the body was when the picture was taken, at its clock offset and lever arm:
+The pose of the camera follows from that of the body at the time of the image, with clock offset and lever arm:
 
     nav_t_cam = nav_t_body + nav_R_body body_t_cam,    nav_R_cam = nav_R_body body_R_cam Exp(boresight)
 
 GPSImgDirection is the azimuth of the optical axis from true north at the camera, left out where the axis points
-within `STEEP_DEG` of the vertical. Altitudes are ellipsoidal, as Exif 3.0 has them. GPSHPositioningError is one sigma
-horizontal, sqrt(var_e + var_n), of the body. Between the rows of the solution, position follows the cubic that meets
-positions and velocities, attitude the shortest turn: smooth with ``--rate imu`` where they lie far apart.
+within `STEEP_DEG` of the vertical. Altitudes are ellipsoidal, as in Exif 3.0. GPSHPositioningError is one sigma
+horizontal, sqrt(var_e + var_n), of the body. Between the rows of the solution, position is interpolated by a cubic
+Hermite spline with the velocities, attitude by slerp: smooth with ``--rate imu`` where rows are far apart.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing
 from smartnav_graph.core.frames import LocalFrame
@@ -33,13 +32,17 @@ from smartnav_graph.core.timebase import interpolate, ns_from_seconds, seconds_s
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.export.exif import with_exif
+from smartnav_graph.output.summary_json import Summary, list_of, table_of
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.images import Picture, pictures
 
+if TYPE_CHECKING:
+    from PIL.TiffImagePlugin import IFDRational
+
 TABLE = "geotags.csv"
 STEEP_DEG = 5.0
-AHEAD_M = 100.0  # the azimuth is that of a point so far along the optical axis
+AHEAD_M = 100.0  # the azimuth is that of a point at this distance on the optical axis
 GPS_IFD = 0x8825
 # Tags of the GPS part, Exif 3.0 table 15.
 VERSION, DATUM, PROCESSING, ERROR = 0, 18, 27, 31
@@ -49,7 +52,7 @@ TIME, DIRECTION_REF, DIRECTION, DATE = 7, 16, 17, 29
 
 @dataclass(frozen=True)
 class Place:
-    """Where one picture was taken: lat, lon deg, ellipsoidal height m; direction deg, NaN where none; sigmas m."""
+    """Position and direction of one image: lat, lon deg, ellipsoidal height m; direction deg or NaN; sigmas m."""
 
     t_ns: int
     lat_deg: float
@@ -62,7 +65,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Geotags:
-    """How many pictures were written, and how many were not, by reason."""
+    """Number of images written, and of those left out by reason."""
 
     written: int
     left_out: Mapping[str, int]
@@ -74,25 +77,25 @@ def export_pictures(
     path: str | Path,
     *,
     calibration: Calibration | None = None,
-    states: Mapping[str, Any] | None = None,
+    states: Summary | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> Geotags:
-    """Write a folder of copies with EXIF position and direction, and a table of the same; originals are only read.
+    """Write a folder of copies with EXIF position and direction, and a table of the same; originals stay unchanged.
 
     Parameters
     ----------
-    session : with pictures; their files may be JPEG or PNG, and are copied byte by byte but for the EXIF
+    session : with images (JPEG or PNG files); all bytes but the EXIF are copied unchanged
     path : the new folder
     calibration : of the run, for the clock offset of the camera; the session's own by default
-    states : of the run's summary: clock offset and boresight found beside the calibration
+    states : of the run's summary: estimated clock offset and boresight
     force : replace an older folder of the same kind
-    progress : told of every picture
+    progress : called for every image
 
     Raises
     ------
     SessionError
-        No origin, no pictures, none of them inside the run; the place is taken.
+        No origin, no images, none of them inside the run; the path is taken.
     """
     if solution.origin is None:
         raise SessionError(
@@ -127,38 +130,34 @@ def export_pictures(
     return Geotags(len(rows), {reason: n for reason, n in left_out.items() if n})
 
 
-def clock_offsets_ns(
-    session: Session, calibration: Calibration | None, states: Mapping[str, Any] | None
-) -> NDArray[np.int64]:
-    """What to add to the stamps (n,) of the images: what each camera's calibration knows, and what the run found."""
+def clock_offsets_ns(session: Session, calibration: Calibration | None, states: Summary | None) -> Times:
+    """Clock offsets (n,) of the images: of each camera's calibration, and as estimated by the run."""
     assert session.images is not None  # `pictures` found some
     cameras = {} if calibration is None else calibration.cameras
-    main, left = camera_name(session, calibration), float(_state(states, "images_time_offset_s", 1)[0])
+    main, estimated = camera_name(session, calibration), float(_state(states, "images_time_offset_s", 1)[0])
     offsets = [
-        (cameras[name].time_offset_s if name in cameras else 0.0) + (left if name == main else 0.0)
+        (cameras[name].time_offset_s if name in cameras else 0.0) + (estimated if name == main else 0.0)
         for name in map(str, session.images.camera)
     ]
     return ns_from_seconds(np.array(offsets))
 
 
-def _state(states: Mapping[str, Any] | None, name: str, size: int) -> Floats:
-    value = ((states or {}).get(name) or {}).get("value", np.zeros(size))
+def _state(states: Summary | None, name: str, size: int) -> Floats:
+    value = list_of(table_of(states or {}, name), "value") or np.zeros(size)
     return np.asarray(value, dtype=np.float64).reshape(size)
 
 
-def places(
-    solution: Solution, session: Session, taken: list[Picture], t_ns: NDArray[np.int64], boresight: Floats
-) -> list[Place]:
-    """Where pictures (n,) were taken, at the times t_ns (n,) of the body's clock."""
+def places(solution: Solution, session: Session, taken: list[Picture], t_ns: Times, boresight: Floats) -> list[Place]:
+    """Positions of images (n,) taken at t_ns (n,) of the body's clock."""
     assert solution.origin is not None
     frame = LocalFrame(solution.origin)
     R, p = _poses(solution, t_ns)
     mounts = [session.mount(picture.camera) for picture in taken]
-    arms, turns = np.array([m.body_t for m in mounts]), np.array([m.body_R for m in mounts])
+    arms, rotations = np.array([m.body_t for m in mounts]), np.array([m.body_R for m in mounts])
     main = np.array([picture.camera == camera_name(session, session.calibration) for picture in taken])
-    turns = turns @ exp(main[:, None] * boresight)
+    rotations = rotations @ exp(main[:, None] * boresight)
     at = p + rotate(R, arms)
-    axis = (R @ turns)[:, :, 2]
+    axis = (R @ rotations)[:, :, 2]
     lla, variance = frame.lla_from_nav(at), interpolate(t_ns, solution.t_ns, solution.sigmas[:, POS] ** 2)
     direction = _azimuths(frame, at, axis)
     horizontal, up = np.sqrt(variance[:, :2].sum(axis=1)), np.sqrt(variance[:, 2])
@@ -166,12 +165,12 @@ def places(
     return [Place(int(t), *row) for t, row in zip(t_ns, columns, strict=True)]
 
 
-def _poses(solution: Solution, t_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _poses(solution: Solution, t_ns: Times) -> tuple[Floats, Floats]:
     if len(solution) == 1:
         return np.tile(solution.nav_R_body, (len(t_ns), 1, 1)), np.tile(solution.nav_t_body, (len(t_ns), 1))
     knots, at = solution.seconds, seconds_since(t_ns, solution.t0_ns)
-    turned = Slerp(knots, Rotation.from_matrix(solution.nav_R_body))(at)
-    return turned.as_matrix(), np.asarray(CubicHermiteSpline(knots, solution.nav_t_body, solution.nav_v_body)(at))
+    R = Slerp(knots, Rotation.from_matrix(solution.nav_R_body))(at)
+    return R.as_matrix(), np.asarray(CubicHermiteSpline(knots, solution.nav_t_body, solution.nav_v_body)(at))
 
 
 def _azimuths(frame: LocalFrame, at: Floats, axis: Floats) -> Floats:
@@ -186,7 +185,7 @@ def _azimuths(frame: LocalFrame, at: Floats, axis: Floats) -> Floats:
 
 
 def _copy(picture: Picture, place: Place, folder: Path, absolute: bool) -> str:
-    """Write one copy; why not, where it cannot be."""
+    """Write one copy; returns why it cannot be written, else nothing."""
     from PIL import Image, UnidentifiedImageError
 
     name = Path(picture.file)
@@ -197,21 +196,21 @@ def _copy(picture: Picture, place: Place, folder: Path, absolute: bool) -> str:
         with Image.open(picture.path) as opened:
             exif = opened.getexif()
         place_tags = exif.get_ifd(GPS_IFD)
-        place_tags.clear()  # an older place, and what was said of it
+        place_tags.clear()  # an older position with its attributes
         place_tags.update(gps_tags(place, absolute))
         new = with_exif(data, exif.tobytes().removeprefix(b"Exif\0\0"))
     except FileNotFoundError:
         return "missing file"
     except (UnidentifiedImageError, ValueError):
-        return "no sound JPEG or PNG"
+        return "damaged JPEG or PNG"
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(new)
     return ""
 
 
-def gps_tags(place: Place, absolute: bool) -> dict[int, Any]:
-    """The GPS part of the EXIF by tag number; the time only where the clock tells it."""
-    tags: dict[int, Any] = {
+def gps_tags(place: Place, absolute: bool) -> dict[int, object]:
+    """The GPS part of the EXIF by tag number; with the time where it is absolute."""
+    tags: dict[int, object] = {
         VERSION: b"\x02\x03\x00\x00",
         LAT_REF: "N" if place.lat_deg >= 0 else "S",
         LAT: _dms(place.lat_deg),
@@ -235,21 +234,21 @@ def gps_tags(place: Place, absolute: bool) -> dict[int, Any]:
     return tags
 
 
-def _dms(degrees: float) -> tuple[Any, Any, Any]:
-    """Degrees, minutes, seconds to 1e-5'' (0.3 mm), carried over where they round to 60."""
+def _dms(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]:
+    """Degrees, minutes, seconds to 1e-5'' (0.3 mm), with carry where they round to 60."""
     whole = round(abs(degrees) * 3600 * 100_000)
     minutes, seconds = divmod(whole, 60 * 100_000)
     return _ratio(minutes // 60, 1), _ratio(minutes % 60, 1), _ratio(seconds / 100_000, 100_000)
 
 
-def _ratio(value: float, parts: int) -> Any:
+def _ratio(value: float, parts: int) -> IFDRational:
     from PIL.TiffImagePlugin import IFDRational
 
     return IFDRational(round(value * parts), parts)
 
 
 def _table(rows: list[tuple[Picture, Place]], path: Path) -> None:
-    """The same as a table that photogrammetry programs import; the direction is empty where there is none."""
+    """The same as a table for photogrammetry programs; an unknown direction is empty."""
     names = ("t_ns", "lat_deg", "lon_deg", "height_m", "direction_deg", "sigma_horizontal_m", "sigma_u_m")
     digits = (None, 10, 10, 4, 3, 4, 4)
     with open(path, "w", encoding="utf-8", newline="") as file:

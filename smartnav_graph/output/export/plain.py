@@ -11,9 +11,9 @@ from smartnav_graph.graph.solution import Solution
 
 
 def write_trajectory_csv(solution: Solution, path: str | Path) -> None:
-    """The columns of trajectory.csv: t_ns whole, floats in the shortest text that reads back the same.
+    """The columns of trajectory.csv: t_ns as integer, floats in the shortest text that reads back the same.
 
-    What is unknown stays empty: latitude, longitude and height without an origin. Writes straight to `path`.
+    Unknown values are empty: latitude, longitude and height without an origin. Writes directly to `path`.
     """
     import pyarrow as pa
     import pyarrow.csv

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.evaluation import Evaluation
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
-from smartnav_graph.output.report.facts import sensor_name, things
 from smartnav_graph.output.report.svg import Axis, Plot, axis, exact_axis, finite, legend, spread_axis, time_axis
-from smartnav_graph.output.report.text import count, fixed, metres, number
 from smartnav_graph.output.report.thin import thin_dots
+from smartnav_graph.output.text import count, fixed, metres, number
 
 Intervals = Sequence[tuple[float, float]]
 
@@ -26,7 +27,7 @@ class Scored(Protocol):
     """Errors at the withheld rows of one sensor: `t_ns` (n,) and `error` (n, 3) m, nav axes."""
 
     @property
-    def t_ns(self) -> NDArray[np.int64]: ...
+    def t_ns(self) -> Times: ...
 
     @property
     def error(self) -> Floats: ...
@@ -54,15 +55,15 @@ def time_of(solution: Solution) -> Axis:
 
 
 def over_time(solution: Solution, y: Axis, title: str, gaps: Intervals, height: int = 190) -> Plot:
-    """An empty plot over the time of a run, its IMU holes shaded."""
+    """An empty plot over the time of a run, its IMU data gaps shaded."""
     plot = Plot(time_of(solution), y, f"{title} over time", title, height_px=height)
     plot.spans(gaps)
     return plot
 
 
 def shaded(gaps: Intervals) -> list[tuple[str, str]]:
-    """The legend of the IMU holes, where there are any."""
-    return [("gap", "IMU hole")] if gaps else []
+    """The legend of the IMU data gaps; empty without gaps."""
+    return [("gap", "IMU data gap")] if gaps else []
 
 
 def uncertainty(solution: Solution, gaps: Intervals, causal: Solution | None) -> str:
@@ -78,7 +79,7 @@ def uncertainty(solution: Solution, gaps: Intervals, causal: Solution | None) ->
     heading = over_time(solution, spread_axis(solution.sigma_heading_deg), "Heading, 1 sigma [°]", gaps, 150)
     heading.line(t, solution.sigma_heading_deg, "s3")
     entries = [(f"line s{i}", name) for i, name in enumerate(AXES)] + [("line s3", "Heading")]
-    entries += [("line causal", "Horizontal while replaying")] if causal is not None else []
+    entries += [("line causal", "Horizontal, causal")] if causal is not None else []
     return figure([position, heading], entries + shaded(gaps))
 
 
@@ -136,12 +137,12 @@ def _unwrapped(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
 def biases(solution: Solution, gaps: Intervals) -> str:
     """Accelerometer and gyroscope biases with bands of one and three sigma."""
     t, sigma = solution.seconds, solution.sigmas
-    rooms = (
+    sensors = (
         ("Accelerometer", "m/s²", solution.accel_bias, sigma[:, ACCEL_BIAS]),
         ("Gyroscope", "°/s", np.degrees(solution.gyro_bias), np.degrees(sigma[:, GYRO_BIAS])),
     )
     figures = []
-    for name, unit, bias, spread in rooms:
+    for name, unit, bias, spread in sensors:
         low, high = bias - 3 * spread, bias + 3 * spread
         for i, letter in enumerate("xyz"):
             y = axis(_core(np.stack([low[:, i], high[:, i]])), count=5)
@@ -153,12 +154,12 @@ def biases(solution: Solution, gaps: Intervals) -> str:
             plot.line(t, bias[:, i], "s0")
             figures.append(figure([plot]))
     marks = [("line s0", "Bias"), ("band s0", "± 1 sigma"), ("band s0 wide", "± 3 sigma"), *shaded(gaps)]
-    note = '<p class="fine">In body axes. Where the first seconds are wider than the frame they are cut.</p>'
+    note = '<p class="fine">In body axes. Wide bands of the first seconds are cut at the frame.</p>'
     return legend(marks) + grid(figures) + note
 
 
 def _core(values: Floats) -> Floats:
-    """What a y axis should span: everything but the most extreme 1 % on either side."""
+    """The range of a y axis: without the most extreme 1 % on either side."""
     v = finite(values)
     return np.percentile(v, [1, 99]) if len(v) else v
 
@@ -187,7 +188,7 @@ def _histogram(sensor: str, white: Floats) -> str:
     normal = np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi)
     y = axis([float(density.max(initial=0.0)), float(normal.max())], include=(0.0,), count=4)
     plot = Plot(exact_axis(-5.0, 5.0, step=1.0), y, f"Histogram of {sensor} residuals", height_px=150)
-    plot.y_title, plot.x_title = f"{sensor_name(sensor)}, density", "Residual / sigma"
+    plot.y_title, plot.x_title = f"{title_of(sensor)}, density", "Residual / sigma"
     plot.bars(edges, density, "s4")
     plot.line(at, normal, "ink")
     far = int((np.abs(white) > 5.0).sum())
@@ -204,7 +205,7 @@ def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
         rows = r.of(sensor) & np.isfinite(r.whitened)
         rejected |= bool((rows & ~r.used).any())
         n = int((np.abs(r.whitened[rows]) > MOST_FAR).sum())
-        far += [f"{sensor_name(sensor)} {count(n)}"] if n else []
+        far += [f"{title_of(sensor)} {count(n)}"] if n else []
     note = f"Beyond ± {fixed(MOST_FAR, 0)} sigma, drawn at the edge: {', '.join(far)}." if far else ""
     entries = [("dots res", "Used"), *([("dots out", "Rejected")] if rejected else []), ("line limit", "± 3 sigma")]
     return figure(plots, [*entries, *shaded(gaps)], note)
@@ -214,7 +215,7 @@ def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
     r, t = solution.residuals, solution.seconds
     seconds = (r.t_ns - solution.t0_ns) / 1e9
     plot = Plot(time_axis(float(t[0]), float(t[-1])), _residual_axis(), f"{sensor} residuals over time")
-    plot.height_px, plot.y_title = 110, f"{sensor_name(sensor)}, residual / sigma"
+    plot.height_px, plot.y_title = 110, f"{title_of(sensor)}, residual / sigma"
     plot.spans(gaps)
     for level in (-3.0, 3.0):
         plot.rule(level, "limit")
@@ -261,39 +262,33 @@ def distribution(errors: ArrayLike, what: str) -> str:
 def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> str:
     """Horizontal errors at withheld measurements: their distribution, and over time beside the estimated sigma."""
     horizontal = np.linalg.norm(np.asarray(scored.error, dtype=np.float64)[:, :2], axis=1)
-    picture = distribution(horizontal, f"withheld {things(name, 2).split(maxsplit=1)[-1]}")
+    picture = distribution(horizontal, f"withheld measurements ({title_of(name)})")
     if len(solution) < 2 or not len(finite(horizontal)):
         return picture
     sigma = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)
     y = axis(np.concatenate([horizontal, finite(sigma)]), include=(0.0,))
     plot = over_time(solution, y, "Horizontal error [m]", gaps)
     plot.line(solution.seconds, sigma, "s3")
-    plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "held")
-    marks = [("dots held", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *shaded(gaps)]
+    plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "withheld")
+    marks = [("dots withheld", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *shaded(gaps)]
     return picture + figure([plot], marks)
 
 
-def errors_over_time(evaluation: Any, solution: Solution, gaps: Intervals) -> str:
+def errors_over_time(evaluation: Evaluation, solution: Solution, gaps: Intervals) -> str:
     """Errors against the reference in east, north, up with the band of one sigma; and the rotation error."""
-    error = getattr(evaluation, "error_enu_m", None)
-    at = getattr(evaluation, "t_ns", None)
-    if error is None or at is None or not len(at):
-        return ""
-    error, t = np.asarray(error, dtype=np.float64), (np.asarray(at) - solution.t0_ns) / 1e9
-    sigma = getattr(evaluation, "sigma_enu", None)
+    error, sigma = evaluation.error_enu_m, evaluation.sigma_enu
+    t = (evaluation.t_ns - solution.t0_ns) / 1e9
     limit = axis(error, include=(0.0,), count=4)
     plots = []
     for i, name in enumerate(AXES):
         plot = over_time(solution, limit, f"{name} error [m]", gaps, 130)
-        if sigma is not None:
-            spread = np.asarray(sigma, dtype=np.float64)[:, i]
-            plot.band(t, -spread, spread, f"s{i}")
+        plot.band(t, -sigma[:, i], sigma[:, i], f"s{i}")
         plot.line(t, error[:, i], f"s{i} solid")
         plots.append(plot)
-    rotation = getattr(evaluation, "rotation_error_deg", None)
+    rotation = evaluation.rotation_error_deg
     if rotation is not None and len(finite(rotation)):
-        turn = over_time(solution, axis(rotation, include=(0.0,), count=4), "Rotation error [°]", gaps, 130)
-        turn.line(t, np.asarray(rotation, dtype=np.float64), "s3")
-        plots.append(turn)
-    band = [("band s0", "± 1 sigma, as estimated")] if sigma is not None else []
-    return figure(plots, [*((f"line s{i} solid", f"{n} error") for i, n in enumerate(AXES)), *band, *shaded(gaps)])
+        plot = over_time(solution, axis(rotation, include=(0.0,), count=4), "Rotation error [°]", gaps, 130)
+        plot.line(t, rotation, "s3")
+        plots.append(plot)
+    entries = [(f"line s{i} solid", f"{name} error") for i, name in enumerate(AXES)]
+    return figure(plots, [*entries, ("band s0", "± 1 sigma, as estimated"), *shaded(gaps)])

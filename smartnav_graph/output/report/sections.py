@@ -6,18 +6,26 @@ import re
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from smartnav_graph.estimate.result.diagnostics import Updates
+from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.graph.solution import Solution
-from smartnav_graph.output.report import charts, constants, facts, replays, statistics, timeline, track, usage
-from smartnav_graph.output.report.text import as_float, attributes, fixed, metres, plural
+from smartnav_graph.output.report import (
+    causal,
+    charts,
+    facts,
+    reference,
+    session_states,
+    statistics,
+    timeline,
+    track,
+    usage,
+)
+from smartnav_graph.output.summary_json import ImuGap, Summary, imu_gaps, numbers_of
+from smartnav_graph.output.text import Table, attributes, fixed, metres, plural
 from smartnav_graph.session.session import Session
-
-Summary = Mapping[str, Any]
 
 TEMPLATE = """<!doctype html>
 <html lang="en">
@@ -42,27 +50,26 @@ def page(
     session: Session,
     solution: Solution,
     summary: Summary,
-    evaluation: Any,
-    causal: Solution | None,
+    evaluation: Evaluation | None,
+    causal_solution: Solution | None,
     scored: Mapping[str, charts.Scored],
     updates: Updates | None = None,
 ) -> str:
     """The whole HTML text."""
-    holes = facts.gaps(summary)
-    shaded = [(start, start + length) for start, length, _ in holes]
-    compared = facts.evaluation_facts(evaluation)
+    gaps = imu_gaps(summary)
+    shaded = [(start, start + length) for start, length, _ in gaps]
     parts = [
         warnings(solution, summary),
-        section("map", "Trajectory", track.draw(session, solution, holes, causal)),
-        section("timeline", "What happened when", timeline.draw(solution, summary, shaded, scored)),
-        section("statistics", "The run in figures", statistics.table(session, solution, summary).html()),
+        section("map", "Trajectory", track.draw(session, solution, gaps, causal_solution)),
+        section("timeline", "Timeline", timeline.draw(solution, summary, shaded, scored)),
+        section("statistics", "Summary", statistics.table(session, solution, summary).html()),
         used(session, solution, summary),
-        imu_holes(summary, holes),
-        *over_time(solution, shaded, causal),
-        section("updates", "While replaying", replays.draw(updates, solution, shaded) if updates is not None else ""),
+        gap_section(summary, gaps),
+        *over_time(solution, shaded, causal_solution),
+        section("updates", "Real-time (causal) performance", causal.draw(updates, solution, shaded) if updates else ""),
         withheld(summary, scored, solution, shaded),
-        against_reference(evaluation, compared, solution, shaded),
-        *machinery(summary),
+        against_reference(evaluation, solution, shaded),
+        *estimation(summary),
     ]
     body = "\n".join(part for part in parts if part)
     body = head(session, solution, summary) + contents(body) + body
@@ -71,7 +78,7 @@ def page(
     return TEMPLATE.format(title=escape(f"{name}: run report"), style=style, body=body)
 
 
-def section(name: str, title: str, body: str, data: Mapping[str, Any] | None = None) -> str:
+def section(name: str, title: str, body: str, data: Mapping[str, object] | None = None) -> str:
     """A titled section; empty when it has no body."""
     if not body:
         return ""
@@ -79,21 +86,21 @@ def section(name: str, title: str, body: str, data: Mapping[str, Any] | None = N
 
 
 def contents(body: str) -> str:
-    """Links to the sections that are there."""
+    """Links to the sections of the page."""
     found = re.findall(r'<section id="([a-z-]+)"[^>]*><h2>([^<]+)</h2>', body)
     links = "".join(f'<a href="#{name}">{title}</a>' for name, title in found)
     return f'<nav aria-label="Contents">{links}</nav>'
 
 
 def head(session: Session, solution: Solution, summary: Summary) -> str:
-    """Title, headline sentences, the figures that matter most."""
+    """Title, headline sentences, key figures."""
     device = "" if session.device.name == "unknown" else session.device.name
     name = session.path.name if session.path else device or "Recorded session"
-    sure = statistics.certainty(solution)
-    sentences = " ".join(escape(s) for s in facts.headline(summary, sure))
+    uncertainty = statistics.horizontal_uncertainty(solution)
+    sentences = " ".join(escape(s) for s in facts.headline(summary, uncertainty))
     tiles = "".join(
-        f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>"
-        for label, value in statistics.key_figures(summary, sure)
+        f"<div><dt>{escape(title)}</dt><dd>{escape(value)}</dd></div>"
+        for title, value in statistics.key_figures(summary, uncertainty)
     )
     kicker = f"smartnav run report · {device}" if session.path and device else "smartnav run report"
     return (
@@ -103,113 +110,114 @@ def head(session: Session, solution: Solution, summary: Summary) -> str:
 
 
 def sigma_sentence(solution: Solution) -> str:
-    """How well the position is known at t = 300 s, or in the middle of a shorter run."""
+    """Position sigmas at t = 300 s, or in the middle of a shorter run."""
     known = statistics.sigma_at(solution)
     if known is None:
-        return '<p id="sigma-at">The run gives no position uncertainty.</p>'
+        return '<p id="sigma-at">The position uncertainty is unknown.</p>'
     t, (e, n, u) = known
     horizontal = float(np.hypot(e, n))
     at = fixed(t, 0 if float(t).is_integer() else 1)
     data = {"t-s": t, "sigma-e-m": e, "sigma-n-m": n, "sigma-u-m": u, "sigma-horizontal-m": horizontal}
     return (
-        f'<p id="sigma-at"{attributes(data)}>At t = {at} s the position is known to {metres(horizontal)} '
-        f"(1 sigma, horizontal): {metres(e)} east, {metres(n)} north, and {metres(u)} in height.</p>"
-        '<p class="fine">Horizontal means √(σ<sub>e</sub>² + σ<sub>n</sub>²), as for the errors below. '
+        f'<p id="sigma-at"{attributes(data)}>Position, 1 sigma at t = {at} s: {metres(horizontal)} horizontal '
+        f"({metres(e)} east, {metres(n)} north), {metres(u)} vertical.</p>"
+        '<p class="fine">Horizontal: √(σ<sub>e</sub>² + σ<sub>n</sub>²), as for the errors below. '
         "Seconds count from the first IMU sample.</p>"
     )
 
 
 def warnings(solution: Solution, summary: Summary) -> str:
-    """What to be careful about, and what to do."""
-    told = usage.lost_warnings(solution) + facts.warnings(summary)
-    if not told:
+    """What may be wrong, and what to do."""
+    found = usage.lost_warnings(solution) + facts.warnings(summary)
+    if not found:
         text = "No warnings." if "warnings" in summary else "The run did not record warnings."
         return section("warnings", "Warnings", f'<p class="calm">{text}</p>', {"count": 0})
     items = "".join(
         f"<li><strong>{escape(what)}</strong>{f'<span>{escape(remedy)}</span>' if remedy else ''}</li>"
-        for what, remedy in told
+        for what, remedy in found
     )
-    return section("warnings", "Warnings", f'<ul class="warnings">{items}</ul>', {"count": len(told)})
+    return section("warnings", "Warnings", f'<ul class="warnings">{items}</ul>', {"count": len(found)})
 
 
 def used(session: Session, solution: Solution, summary: Summary) -> str:
-    """What was used, dropped, rejected, and why."""
+    """Measurements used, dropped and rejected, and why."""
     recorded = {name: len(stream) for name, stream in session.streams().items() if name != "reference"}
     lines = "".join(f"<li>{escape(line)}</li>" for line in usage.why_lines(summary))
     why = f'<ul class="plain">{lines}</ul>' if lines else '<p class="calm">Nothing was rejected or dropped.</p>'
     if not lines and not {"rejected", "dropped"} & set(summary):
         why = '<p class="calm">The run did not record what was rejected or dropped.</p>'
-    careful = usage.careful_sentence(summary)
+    small = usage.small_residuals_sentence(summary)
     parts = [
         usage.used_table(summary, recorded).html(),
         why,
-        _silence(solution),
+        _outage(solution),
         _rejections(summary),
         *(
             table.html()
             for table in (
-                usage.fates_table(summary, "image_pairs", "image pairs"),
-                usage.fates_table(summary, "tracks", "tracked points in space"),
-                usage.assumed_table(summary),
+                usage.outcomes_table(summary, "image_pairs", "image pairs"),
+                usage.outcomes_table(summary, "tracks", "tracked points"),
+                usage.models_table(summary),
             )
             if table
         ),
-        f"<p>{escape(careful)}</p>" if careful else "",
-        '<p class="fine">χ² / dof: squared residuals over their sigmas, per redundant measurement; '
-        "1 means the stated noise is right.</p>",
+        f"<p>{escape(small)}</p>" if small else "",
+        '<p class="fine">χ² / dof: sum of the squared residuals over their sigmas, divided by the redundancy; '
+        "expected 1.</p>",
     ]
-    return section("used", "What was used", "".join(parts))
+    return section("used", "Measurements used", "".join(parts))
 
 
-def _silence(solution: Solution) -> str:
-    """The longest stretch without a position."""
-    silence = usage.longest_silence(solution)
-    if silence is None:
+def _outage(solution: Solution) -> str:
+    """The longest time without a position."""
+    outage = usage.longest_outage(solution)
+    if outage is None:
         return ""
-    data = {"start-s": silence.start_s, "length-s": silence.length_s}
-    return f'<p id="silence"{attributes(data)}>{escape(usage.silence_sentence(silence))}</p>'
+    data = {"start-s": outage.start_s, "length-s": outage.length_s}
+    return f'<p id="outage"{attributes(data)}>{escape(usage.outage_sentence(outage))}</p>'
 
 
 def _rejections(summary: Summary) -> str:
-    """The rejected measurements one by one, folded away."""
+    """The rejected measurements one by one, collapsed."""
     table = usage.rejections_table(summary)
     if not table.rows:
         return ""
-    head = f"Each of the {plural(len(table.rows), 'rejected measurement')}"
+    head = f"{plural(len(table.rows), 'rejected measurement')}"
     return f'<details class="rejections"><summary>{escape(head)}</summary>{table.html()}</details>'
 
 
-def imu_holes(summary: Summary, holes: list[tuple[float, float, str]]) -> str:
-    """Stretches without honest inertial data."""
-    if not holes:
+def gap_section(summary: Summary, gaps: list[ImuGap]) -> str:
+    """The IMU data gaps."""
+    title = "IMU data gaps"
+    if not gaps:
         known = "gaps" in summary
-        text = "The IMU record has no holes." if known else "The run did not record IMU holes."
-        return section("imu-holes", "IMU holes", f'<p class="calm">{text}</p>', {"count": 0 if known else None})
+        text = "No IMU data gaps." if known else "The run did not record IMU data gaps."
+        return section("imu-gaps", title, f'<p class="calm">{text}</p>', {"count": 0 if known else None})
     items = "".join(
-        f'<li class="hole"{attributes({"start-s": start, "length-s": length, "kind": kind})}>'
-        f"{escape(facts.hole_sentence(start, length, kind))}</li>"
-        for start, length, kind in holes
+        f'<li class="imu-gap"{attributes({"start-s": gap.start_s, "length-s": gap.length_s, "kind": gap.kind})}>'
+        f"{escape(facts.gap_sentence(gap))}</li>"
+        for gap in gaps
     )
-    kinds = {kind for *_, kind in holes}
-    why = {
-        "bridged": "Bridged: on all six axes the samples follow an exact straight line, which no sensor measures; "
-        "somebody filled the hole before import.",
-        "missing": "No samples: the stamps leap.",
+    meaning = {
+        "bridged": "Linearly interpolated: on all six axes the samples follow an exact straight line, which no sensor "
+        "measures; they were made before the import.",
+        "missing": "No samples: timestamps jump.",
     }
-    lead = " ".join(words for kind, words in why.items() if kind in kinds)
-    tail = "Inside a hole the motion is carried on with raised noise, so the uncertainty grows there."
+    lead = " ".join(text for kind, text in meaning.items() if any(gap.kind == kind for gap in gaps))
+    tail = "The gap error model raises the uncertainty of the motion inside a gap."
     body = f'<p>{escape(f"{lead} {tail}".strip())}</p><ul class="plain columns">{items}</ul>'
-    return section("imu-holes", "IMU holes", body, {"count": len(holes), "total-s": round(sum(h[1] for h in holes), 6)})
+    total = round(sum(gap.length_s for gap in gaps), 6)
+    return section("imu-gaps", title, body, {"count": len(gaps), "total-s": total})
 
 
-def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | None) -> list[str]:
-    """Everything drawn over time; nothing for a run of a single epoch."""
+def over_time(solution: Solution, gaps: charts.Intervals, causal_solution: Solution | None) -> list[str]:
+    """The plots over time; none for a run of a single epoch."""
     if len(solution) < 2:
         return []
-    sure = statistics.uncertainty_table(solution).html()
-    sure += '<p class="fine">What determined the state at a time T: smartnav explain RUN --at T.</p>'
+    sigmas = statistics.uncertainty_table(solution).html()
+    sigmas += '<p class="fine">Which measurements determine the state at a time T: smartnav explain RUN --at T.</p>'
     parts = [
-        section("uncertainty", "How sure", charts.uncertainty(solution, gaps, causal) + sure),
+        section("uncertainty", "Uncertainty", charts.uncertainty(solution, gaps, causal_solution) + sigmas),
         section("motion", "Speed and height", charts.motion(solution, gaps)),
         section("attitude", "Attitude", charts.attitude(solution, gaps)),
         section("biases", "Sensor biases", charts.biases(solution, gaps)),
@@ -217,66 +225,69 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal: Solution | Non
     if not len(solution.residuals):
         return [*parts, section("residuals", "Residuals", '<p class="calm">The run recorded no residuals.</p>')]
     note = (
-        '<p class="fine">Residuals remain after the adjustment: where few measurements overlap they come out smaller '
-        "than the standard normal curve. χ² / dof above allows for that.</p>"
+        '<p class="fine">Residuals after the adjustment: with little redundancy they are smaller than the standard '
+        "normal curve; χ² / dof above takes this into account.</p>"
     )
     both = note + charts.residual_histograms(solution) + charts.residuals_over_time(solution, gaps)
     return [*parts, section("residuals", "Residuals", both)]
 
 
 def withheld(summary: Summary, scored: Mapping[str, charts.Scored], solution: Solution, gaps: charts.Intervals) -> str:
-    """Measurements kept from the estimate and scored against it."""
+    """Measurements withheld from the estimate and compared with it."""
     table = usage.withheld_table(summary)
     if not table:
         return ""
     pictures = [charts.withheld(name, rows, solution, gaps) for name, rows in scored.items()]
     lead = (
-        "<p>These measurements were kept from the estimate, then compared with it; the differences hold the errors of "
-        "both.</p>"
+        "<p>These measurements were not used in the estimate; the differences contain the errors of both, measurement "
+        "and estimate.</p>"
     )
-    total = {"count": round(sum(as_float(n) or 0.0 for n in facts.withheld_counts(summary).values()))}
+    total = {"count": round(sum(facts.withheld_counts(summary).values()))}
     return section("withheld", "Withheld measurements", lead + table.html() + "".join(pictures), total)
 
 
-def against_reference(evaluation: Any, compared: Summary, solution: Solution, gaps: charts.Intervals) -> str:
-    """Errors against an independent trajectory."""
-    if not compared:
+def against_reference(evaluation: Evaluation | None, solution: Solution, gaps: charts.Intervals) -> str:
+    """Errors against a reference trajectory."""
+    if evaluation is None:
         return ""
-    error = getattr(evaluation, "error_enu_m", None)
-    horizontal: NDArray[Any] = np.zeros(0) if error is None else np.linalg.norm(np.asarray(error)[:, :2], axis=1)
-    tables = [facts.evaluation_table(compared), facts.relative_table(compared), facts.nees_table(compared)]
-    body = f"<p>{escape(facts.evaluation_sentence(compared))}</p>" + "".join(t.html() for t in tables if t)
-    honest = facts.nees_sentence(compared)
-    body += f"<p>{escape(honest)}</p>" if honest else ""
-    body += "".join(f'<p class="fine">{escape(str(note))}</p>' for note in getattr(evaluation, "notes", ()))
+    compared = reference.figures(evaluation)
+    horizontal = np.linalg.norm(evaluation.error_enu_m[:, :2], axis=1)
+    tables = [reference.absolute_table(compared), reference.relative_table(compared), reference.nees_table(compared)]
+    body = f"<p>{escape(reference.matched_sentence(compared))}</p>" + "".join(t.html() for t in tables if t)
+    consistency = reference.nees_sentence(compared)
+    body += f"<p>{escape(consistency)}</p>" if consistency else ""
+    body += "".join(f'<p class="fine">{escape(note)}</p>' for note in evaluation.notes)
     body += charts.distribution(horizontal, "errors against the reference")
     if len(solution) > 1:
         body += charts.errors_over_time(evaluation, solution, gaps)
-    return section("reference", "Against the reference", body)
+    return section("reference", "Comparison with the reference", body)
 
 
-def machinery(summary: Summary) -> list[str]:
-    """States, start, solver, timings, versions."""
-    sentence, start = constants.initialisation(summary)
-    said = f"<p>{escape(sentence)}</p>" if sentence else ""
-    began = said + (start.html() if start else "")
-    clocks = "".join(f'<p class="clock">{escape(told)}</p>' for told in constants.clock_sentences(summary))
-    states = "".join(table.html() for _, table in constants.constants(summary))
-    solver, versions = facts.solver_table(summary), facts.versions_table(summary)
+def estimation(summary: Summary) -> list[str]:
+    """Session states, initialisation, solver, timings, versions."""
+    sentence, start = session_states.initialisation(summary)
+    began = (f"<p>{escape(sentence)}</p>" if sentence else "") + _html(start)
+    clocks = "".join(f'<p class="clock">{escape(text)}</p>' for text in session_states.clock_sentences(summary))
+    states = "".join(table.html() for _, table in session_states.tables(summary))
     return [
-        section("states", "Clocks, mounts and noise", clocks + states),
-        section("start", "How the start was found", began or '<p class="calm">The run did not record it.</p>'),
-        section("solver", "Solver", solver.html() if solver else ""),
-        section("timings", "Computing time", timing_bars(facts.timings(summary))),
-        section("versions", "Versions", versions.html() if versions else ""),
+        section("states", "Estimated calibration and noise", clocks + states),
+        section("start", "Initialisation", began or '<p class="calm">The run did not record it.</p>'),
+        section("solver", "Solver", _html(facts.solver_table(summary))),
+        section("timings", "Computing time", timing_bars(numbers_of(summary, "timings_s"))),
+        section("versions", "Versions", _html(facts.versions_table(summary))),
     ]
 
 
+def _html(table: Table) -> str:
+    """The HTML of a table; empty without rows."""
+    return table.html() if table else ""
+
+
 def timing_bars(timings: Mapping[str, float]) -> str:
-    """Seconds of every step as a bar beside its number."""
+    """Seconds of each part of the computation, with bars."""
     most = max((v for v in timings.values()), default=0.0)
     rows = "".join(
-        f'<tr><th scope="row">{escape(facts.step_name(name, timings))}</th>'
+        f'<tr><th scope="row">{escape(facts.timing_name(name, timings))}</th>'
         f'<td class="n">{fixed(value, 3)} s</td><td class="wide">'
         f'<svg class="meter" viewBox="0 0 1000 10" preserveAspectRatio="none" aria-hidden="true">'
         f'<rect class="{"total" if name == "total" else "part"}" width="{1000 * value / most if most else 0:.0f}" '

@@ -1,21 +1,19 @@
-"""Figures of one run, computed from its states and its recording."""
+"""Figures of one run, computed from its states and its session."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import interpolate, seconds_since
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Solution
-from smartnav_graph.output.report.facts import Certainty, room, sensor_name, withheld_counts
-from smartnav_graph.output.report.text import (
+from smartnav_graph.output.report.facts import Uncertainty, withheld_counts
+from smartnav_graph.output.summary_json import Summary, numbers_of, table_of
+from smartnav_graph.output.text import (
     Row,
     Table,
-    as_float,
     count,
     distance,
     duration,
@@ -32,13 +30,13 @@ AT_S = 300.0
 SLOW_M_S = 0.1
 
 
-def certainty(solution: Solution) -> Certainty | None:
-    """Median and worst horizontal one-sigma position of the run."""
+def horizontal_uncertainty(solution: Solution) -> Uncertainty | None:
+    """Median and largest horizontal one-sigma position of the run."""
     horizontal = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)
     if not len(horizontal) or not np.isfinite(horizontal).all() or horizontal.max() <= 0:
         return None
-    worst = int(np.argmax(horizontal))
-    return Certainty(float(np.median(horizontal)), float(horizontal[worst]), float(solution.seconds[worst]))
+    at = int(np.argmax(horizontal))
+    return Uncertainty(float(np.median(horizontal)), float(horizontal[at]), float(solution.seconds[at]))
 
 
 def sigma_at(solution: Solution) -> tuple[float, Floats] | None:
@@ -50,25 +48,25 @@ def sigma_at(solution: Solution) -> tuple[float, Floats] | None:
     return at, np.array([np.interp(at, t, column) for column in sigma.T])
 
 
-def key_figures(summary: Mapping[str, Any], sure: Certainty | None) -> list[tuple[str, str]]:
+def key_figures(summary: Summary, uncertainty: Uncertainty | None) -> list[tuple[str, str]]:
     """Four to six tiles."""
     tiles = [
         ("Duration", duration(summary.get("duration_s"))),
         ("Distance", distance(summary.get("path_m"))),
-        ("Median 1 sigma", metres(sure.median_m) if sure else "–"),
-        ("χ² / dof", number(room(summary, "chi2_per_dof").get("overall"))),
+        ("Median 1 sigma", metres(uncertainty.median_m) if uncertainty else "–"),
+        ("χ² / dof", number(table_of(summary, "chi2_per_dof").get("overall"))),
     ]
-    if room(summary, "rejected"):
-        tiles.append(("Rejected", count(sum(as_float(n) or 0 for n in room(summary, "rejected").values()))))
+    if table_of(summary, "rejected"):
+        tiles.append(("Rejected", count(sum(numbers_of(summary, "rejected").values()))))
     for name in withheld_counts(summary):
-        rms = room(room(summary, "withheld"), name).get("rms_horizontal_m")
-        if as_float(rms) is not None:
-            tiles.append((f"Withheld {sensor_name(name)}, RMS", metres(rms)))
+        rms = numbers_of(table_of(summary, "withheld"), name).get("rms_horizontal_m")
+        if rms is not None:
+            tiles.append((f"Withheld {title_of(name)}, RMS", metres(rms)))
     return tiles
 
 
-def table(session: Session, solution: Solution, summary: Mapping[str, Any]) -> Table:
-    """Times, lengths, speeds, heights and what the IMU felt."""
+def table(session: Session, solution: Solution, summary: Summary) -> Table:
+    """Times, lengths, speeds, heights, extremes of the IMU."""
     rows = [
         *_when_and_where(session, solution),
         ("Duration", duration(summary.get("duration_s", _span(solution)))),
@@ -76,15 +74,15 @@ def table(session: Session, solution: Solution, summary: Mapping[str, Any]) -> T
         ("Epochs (keyframes)", count(summary.get("keyframes", len(solution)))),
         *_images(session),
         *_motion(solution),
-        *_still(summary),
+        *_standstills(summary),
         *_slow(solution),
-        *_felt(session, solution),
+        *_imu_extremes(session, solution),
     ]
     return Table(("", ""), [Row(cells) for cells in rows])
 
 
 def _when_and_where(session: Session, solution: Solution) -> list[tuple[str, str]]:
-    """Date and place, as far as clock and origin tell them."""
+    """Date and origin, where known."""
     rows = []
     if session.clock_epoch == "unix" and len(solution):
         stamp = np.datetime_as_string(np.datetime64(int(solution.t_ns[0]), "ns"), unit="s")
@@ -128,24 +126,24 @@ def _motion(solution: Solution) -> list[tuple[str, str]]:
 
 
 def _slow(solution: Solution) -> list[tuple[str, str]]:
-    """Time at hardly any speed, whatever the reason."""
+    """Time at nearly zero speed, for any reason."""
     slow = np.linalg.norm(solution.nav_v_body, axis=1) < SLOW_M_S
     return [(f"Slower than {SLOW_M_S} m/s", duration(float(np.diff(solution.seconds)[slow[1:] & slow[:-1]].sum())))]
 
 
-def _still(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Standstills that the detector found or the session listed."""
-    found = room(summary, "standstills")
-    stops, total, rest = (as_float(found.get(k)) for k in ("count", "total_s", "at_rest_s"))
+def _standstills(summary: Summary) -> list[tuple[str, str]]:
+    """Standstills, detected or listed in the session."""
+    found = numbers_of(summary, "standstills")
+    stops, total, rest = (found.get(key) for key in ("count", "total_s", "at_rest_s"))
     if stops is None or total is None:
         return []
     if not stops:
-        return [("Standing still", "never found")]
-    rows = [("Standing still", f"{duration(total)} in {plural(stops, 'stop')}")]
-    return [*rows, ("Of it at rest, without any motion", duration(rest))] if rest is not None else rows
+        return [("Standstills", "none detected")]
+    rows = [("Standstills", f"{plural(stops, 'stop')}, {duration(total)} in all")]
+    return [*rows, ("Of these completely at rest", duration(rest))] if rest is not None else rows
 
 
-def _felt(session: Session, solution: Solution) -> list[tuple[str, str]]:
+def _imu_extremes(session: Session, solution: Solution) -> list[tuple[str, str]]:
     """Extremes of the IMU inside the run."""
     imu = session.imu
     if imu is None or not len(solution):
@@ -170,8 +168,7 @@ def accelerations(imu: Imu, solution: Solution, gravity: float) -> Floats:
     """Size (n,) m/s^2 of the acceleration over ground at inertial samples: ``nav_R_body (f - bias) - gravity up``."""
     bias = interpolate(imu.t_ns, solution.t_ns, solution.accel_bias)
     if len(solution) > 1:
-        turned = Slerp(solution.seconds, Rotation.from_matrix(solution.nav_R_body))
-        R = turned(seconds_since(imu.t_ns, solution.t0_ns))
+        R = Slerp(solution.seconds, Rotation.from_matrix(solution.nav_R_body))(seconds_since(imu.t_ns, solution.t0_ns))
     else:
         R = Rotation.from_matrix(solution.nav_R_body[0])
     return np.asarray(np.linalg.norm(R.apply(imu.accel - bias) - [0.0, 0.0, gravity], axis=1))

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.output.report.text import fixed
 from smartnav_graph.output.report.thin import thin_band, thin_line
+from smartnav_graph.output.text import fixed
 
 UNITS = 10000
 LONGEST = 7
@@ -25,7 +25,7 @@ TIME_STEPS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14
 
 @dataclass(frozen=True)
 class Axis:
-    """Range `lo` .. `hi` in data units with labelled ticks; labels tell the value less `offset`."""
+    """Range `lo` .. `hi` in data units with labelled ticks; labels show the value minus `offset`."""
 
     lo: float
     hi: float
@@ -36,7 +36,7 @@ class Axis:
 
     def titled(self, title: str) -> str:
         """The title of the axis, with the offset of its labels."""
-        return f"{title}, less {fixed(self.offset, 3).rstrip('0').rstrip('.')}" if self.offset and title else title
+        return f"{title}, minus {fixed(self.offset, 3).rstrip('0').rstrip('.')}" if self.offset and title else title
 
     def fraction(self, values: ArrayLike) -> Floats:
         """Position of `values` along the axis, 0 at `lo`, 1 at `hi`."""
@@ -62,7 +62,7 @@ def round_step(span: float, at_most: int) -> float:
 def ticked(lo: float, hi: float, step: float) -> Axis:
     """Axis with ticks at the multiples of `step` inside [lo, hi], and labels of just enough decimals.
 
-    Labels of more than `LONGEST` characters are told less a round offset, or else with a power of ten.
+    Labels of more than `LONGEST` characters are shown minus a round offset, or else with a power of ten.
     """
     first, last = math.ceil(lo / step - 1e-9), math.floor(hi / step + 1e-9)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
@@ -98,7 +98,7 @@ def exact_axis(lo: float, hi: float, *, count: int = 6, step: float | None = Non
 
 
 def time_axis(lo: float, hi: float, count: int = 12) -> Axis:
-    """Seconds since the start; ticks at whole seconds, minutes and hours told in seconds."""
+    """Seconds since the start; ticks in seconds, at whole seconds, minutes or hours."""
     span = max(hi - lo, 1e-9)
     return exact_axis(lo, hi, step=next((s for s in TIME_STEPS if span / s <= count), None), count=count)
 
@@ -152,7 +152,7 @@ class Plot:
         return UNITS / self.aspect if self.aspect else UNITS
 
     def points(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.int64]:
-        """Integer drawing units (n, 2); far outliers are held just outside the box."""
+        """Integer drawing units (n, 2); far outliers are moved to just outside the box."""
         fx = np.clip(self.x.fraction(x), -1.0, 2.0)
         fy = np.clip(1.0 - self.y.fraction(y), -1.0, 2.0)
         return np.rint(np.stack([fx * UNITS, fy * self._height], axis=-1)).astype(np.int64)
@@ -190,7 +190,7 @@ class Plot:
         self._shapes.append(f'<path class="{cls}" d="{path(self.points(ring_x, ring_y))}z"/>')
 
     def spans(self, intervals: Iterable[tuple[float, float]], cls: str = "gap") -> None:
-        """Shaded stretches of the x axis, never thinner than can be seen."""
+        """Shaded spans of the x axis, with a minimum width."""
         for start, end in intervals:
             a, b = self.points([max(start, self.x.lo), min(end, self.x.hi)], [self.y.lo, self.y.lo])[:, 0]
             if end >= self.x.lo and start <= self.x.hi:
@@ -272,10 +272,10 @@ def path(points: NDArray[np.int64]) -> str:
 
 
 def legend(entries: Sequence[tuple[str, str]]) -> str:
-    """A list of (class, words): a sample of the mark beside its meaning."""
+    """A list of (class, text): a sample of the mark beside its meaning."""
     items = "".join(
-        f'<li><svg class="key" viewBox="0 0 24 10" aria-hidden="true">{_sample(cls)}</svg>{escape(words)}</li>'
-        for cls, words in entries
+        f'<li><svg class="key" viewBox="0 0 24 10" aria-hidden="true">{_sample(cls)}</svg>{escape(text)}</li>'
+        for cls, text in entries
     )
     return f'<ul class="legend">{items}</ul>' if items else ""
 

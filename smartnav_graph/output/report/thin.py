@@ -1,7 +1,7 @@
 """Fewer points, same picture: how lines, bands and dots are thinned before they are drawn.
 
-* A line over time: the time span is cut into equal buckets, and of each bucket the lowest and the highest point stay
-  (so that no spike vanishes), with the first and the last point of the line.
+* A line over time: the lowest and the highest point of each of many equal buckets are kept (so that spikes
+  remain), with the first and the last point of the line.
 * A band: of each bucket the lowest lower and the highest upper edge.
 * A path on the map: Ramer-Douglas-Peucker (Douglas and Peucker 1973), the tolerance doubled until it fits.
 * Dots: an even random choice with a fixed seed (every 9th row would show one axis only), outliers first.

@@ -1,4 +1,4 @@
-"""What happened when: one lane a sensor or event along the time of the run."""
+"""Timeline: one lane for each sensor or event."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report.charts import Intervals, Scored, figure, time_of
-from smartnav_graph.output.report.facts import Summary, room, sensor_name
 from smartnav_graph.output.report.svg import Axis, Plot
-from smartnav_graph.output.report.text import count
 from smartnav_graph.output.report.thin import thin_dots
+from smartnav_graph.output.summary_json import Summary, as_float, numbers_of, rows_of, standstill_spans, text_of
+from smartnav_graph.output.text import count
 from smartnav_graph.session.streams import POSITIONS
 
 LANE_PX = 34
 BAR, OUT = (0.14, 0.44), (0.05, 0.53)  # shares of its lane that a bar and a rejected event fill, from below
 NARROWEST = 1 / 500  # of the whole width
-SINGLE = 150  # so many events are drawn one by one, more as stretches
+SINGLE = 150  # up to so many events are drawn one by one, more as spans
 IMAGES = ("image_pairs", "smart")
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Name, stretches s, their class, and single events s that stand out (class ``out``)."""
+    """Name, spans s, their CSS class, and single rejected events s (class ``out``)."""
 
     name: str
     spans: Intervals
@@ -34,30 +35,31 @@ class Lane:
 
 
 def lanes(solution: Solution, summary: Summary, gaps: Intervals, withheld: Mapping[str, Scored]) -> list[Lane]:
-    """The lanes that have something to show."""
+    """The lanes that are not empty."""
     none = np.zeros(0)
     found = []
     for name in (*POSITIONS, *IMAGES):
         used, out = _times(solution, name, True), _rejected(solution, summary, name)
         if len(used) or len(out):
-            number = int(room(summary, "rejected").get(name) or len(out))
+            number = int(numbers_of(summary, "rejected").get(name) or len(out))
             rejected = f", {count(number)} rejected" if number else ""
-            found.append(Lane(f"{sensor_name(name)} in use{rejected}", stretches(used), "used", out))
+            found.append(Lane(f"{title_of(name)} in use{rejected}", event_spans(used), "used", out))
     for name, rows in withheld.items():
         t = np.unique((np.asarray(rows.t_ns) - solution.t0_ns) / 1e9)
-        found.append(Lane(f"{sensor_name(name)} withheld", stretches(t), "held", none))
-    spans = [(float(a), float(b)) for a, b in room(summary, "standstills").get("spans_s") or []]
-    if spans:
-        found.append(Lane("Standing still", spans, "still", none))
+        found.append(Lane(f"{title_of(name)} withheld", event_spans(t), "withheld", none))
+    standstills = standstill_spans(summary)
+    if standstills:
+        found.append(Lane("Standstills", standstills, "standstill", none))
     if gaps:
-        found.append(Lane("IMU holes", gaps, "hole", none))
+        found.append(Lane("IMU data gaps", gaps, "imu-gap", none))
     return found
 
 
 def _rejected(solution: Solution, summary: Summary, sensor: str) -> Floats:
-    """Times s of what was rejected, as the run told it: an image pair may end where another one is in use."""
-    told = [float(one["t_s"]) for one in summary.get("rejections") or () if one["sensor"] == sensor]
-    return np.unique(told) if told else _times(solution, sensor, False)
+    """Times s of the rejections in the summary, else of rows that were not used: two image pairs may share an epoch."""
+    rows = [as_float(row.get("t_s")) for row in rows_of(summary, "rejections") if text_of(row, "sensor") == sensor]
+    times = [t for t in rows if t is not None]
+    return np.unique(times) if times else _times(solution, sensor, False)
 
 
 def _times(solution: Solution, sensor: str, used: bool) -> Floats:
@@ -71,8 +73,8 @@ def _times(solution: Solution, sensor: str, used: bool) -> Floats:
     return np.asarray((rest - solution.t0_ns) / 1e9)
 
 
-def stretches(t: Floats) -> list[tuple[float, float]]:
-    """Few events as they are, many as stretches that break where three of their usual spacings pass without one."""
+def event_spans(t: Floats) -> list[tuple[float, float]]:
+    """Few events one by one; many as spans, split where three median spacings pass without an event."""
     if len(t) <= SINGLE:
         return [(float(x), float(x)) for x in t]
     step = np.diff(t)
@@ -82,13 +84,13 @@ def stretches(t: Floats) -> list[tuple[float, float]]:
 
 
 def draw(solution: Solution, summary: Summary, gaps: Intervals, withheld: Mapping[str, Scored]) -> str:
-    """The lanes as one figure; empty for a run of a single epoch, or with nothing to show."""
+    """The lanes as one figure; empty for a run of a single epoch, or without lanes."""
     found = lanes(solution, summary, gaps, withheld) if len(solution) > 1 else []
     if not found:
         return ""
     n = len(found)
     edges = tuple(float(i) for i in range(n + 1))
-    plot = Plot(time_of(solution), Axis(0.0, float(n), edges, ("",) * (n + 1)), "What happened when")
+    plot = Plot(time_of(solution), Axis(0.0, float(n), edges, ("",) * (n + 1)), "Timeline")
     plot.height_px = LANE_PX * n
     for i, lane in enumerate(found):
         _lane(plot, lane, float(n - 1 - i))

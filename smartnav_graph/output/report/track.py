@@ -1,4 +1,4 @@
-"""The trajectory on a plain map: equal axes, metres, what was used, what was rejected, how sure."""
+"""The trajectory on a map in metres: path, fixes used and rejected, uncertainty ellipses, IMU data gaps."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import nearest
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Residuals, Solution
 from smartnav_graph.output.report.svg import Axis, Plot, legend, round_step, ticked
-from smartnav_graph.output.report.text import capital, count, fixed
 from smartnav_graph.output.report.thin import thin_path
+from smartnav_graph.output.text import count, fixed
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
-from smartnav_graph.session.streams import STREAMS
 
 SHAPES = (1.25, 2.4)  # width / height of the map
 ELLIPSES = 30
@@ -68,33 +68,33 @@ def draw(
     """The map as a figure with its legend."""
     path = solution.nav_t_body[:, :2]
     if len(solution) < 2 or not np.isfinite(path).all():
-        return "<p>The run has no path to draw.</p>"
+        return "<p>The run has no path.</p>"
     fixes = fix_states(session, solution)
     near = _near(path, fixes)
     x, y, aspect = _axes(np.concatenate([path, near]))
     plot = Plot(x, y, "Map of the trajectory, east and north in metres", "North [m]", "East [m]", aspect=aspect)
     under = _ellipses(plot, solution) + _gaps(plot, solution, gaps)
-    entries = [("line way", "Smoothed path"), *_fixes(plot, fixes, ("used", "unused"))]
+    entries = [("line path", "Smoothed path"), *_fixes(plot, fixes, ("used", "unused"))]
     if causal is not None and len(causal) > 1:
-        _way(plot, causal.nav_t_body[:, :2], "line causal")
-        entries.append(("line causal", "Estimate while replaying (causal)"))
-    _way(plot, path, "line way")
+        _path(plot, causal.nav_t_body[:, :2], "line causal")
+        entries.append(("line causal", "Causal estimate"))
+    _path(plot, path, "line path")
     entries += _fixes(plot, fixes, ("rejected",)) + under
     _ends(plot, path)
-    _furniture(plot)
+    _scale_and_north(plot)
     widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
     return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
 
 
 def _near(path: Floats, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) -> Floats:
-    """Fixes that widen the map: none farther outside the path than a fifth of its size."""
+    """Fixes that enlarge the map: at most by a fifth of the size of the path."""
     lo, hi = path.min(axis=0), path.max(axis=0)
     slack = 0.2 * float((hi - lo).max())
     rows = np.concatenate([np.zeros((0, 2)), *(xy for xy, _ in fixes.values())])
     return np.asarray(rows[((rows >= lo - slack) & (rows <= hi + slack)).all(axis=1)])
 
 
-def _way(plot: Plot, xy: Floats, cls: str) -> None:
+def _path(plot: Plot, xy: Floats, cls: str) -> None:
     keep = thin_path(xy, (plot.x.hi - plot.x.lo) / 4000)
     plot.line(xy[keep, 0], xy[keep, 1], cls.removeprefix("line "), thin=False)
 
@@ -102,7 +102,7 @@ def _way(plot: Plot, xy: Floats, cls: str) -> None:
 def _fixes(
     plot: Plot, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]], states: Sequence[str]
 ) -> list[tuple[str, str]]:
-    words = {"used": "used", "unused": "withheld or not used", "rejected": "rejected"}
+    states_shown = {"used": "used", "unused": "withheld or not used", "rejected": "rejected"}
     entries = []
     for name, (xy, state) in fixes.items():
         for key in states:
@@ -114,9 +114,7 @@ def _fixes(
                 cls = f"{'control' if name != 'gnss' and key == 'used' else f'fix-{key}'}"
                 plot.dots(rows[seen, 0], rows[seen, 1], cls)
                 outside = f", {count((~seen).sum())} off the map" if (~seen).any() else ""
-                entries.append(
-                    (f"dots {cls}", f"{capital(STREAMS[name].LABEL.one)} {words[key]} ({count(len(rows))}{outside})")
-                )
+                entries.append((f"dots {cls}", f"{title_of(name)} {states_shown[key]} ({count(len(rows))}{outside})"))
     return entries
 
 
@@ -124,8 +122,8 @@ def _gaps(plot: Plot, solution: Solution, gaps: Sequence[tuple[float, float, str
     t, path = solution.seconds, solution.nav_t_body[:, :2]
     for start, length, _ in gaps:
         at = np.concatenate([[start], t[(t > start) & (t < start + length)], [start + length]])
-        plot.line(np.interp(at, t, path[:, 0]), np.interp(at, t, path[:, 1]), "hole", thin=False)
-    return [("line hole", f"IMU hole ({len(gaps)})")] if gaps else []
+        plot.line(np.interp(at, t, path[:, 0]), np.interp(at, t, path[:, 1]), "imu-gap", thin=False)
+    return [("line imu-gap", f"IMU data gap ({len(gaps)})")] if gaps else []
 
 
 def _ellipses(plot: Plot, solution: Solution) -> list[tuple[str, str]]:
@@ -164,17 +162,17 @@ def _ends(plot: Plot, path: Floats) -> None:
     a, b = path[0], path[-1]
     where = [(float(plot.x.fraction(p[0])), 1 - float(plot.y.fraction(p[1]))) for p in (a, b)]
     left = where[0][0] <= where[1][0]
-    for (fx, fy), p, word, on_left in ((where[0], a, "Start", left), (where[1], b, "End", not left)):
+    for (fx, fy), p, name, on_left in ((where[0], a, "Start", left), (where[1], b, "End", not left)):
         shape = f'cx="{100 * fx:.2f}%" cy="{100 * fy:.2f}%" r="5.5"'
-        plot.raw(f'<circle class="mark {word.lower()}" {shape}/>')
+        plot.raw(f'<circle class="mark {name.lower()}" {shape}/>')
         outward = on_left if 0.12 < fx < 0.88 else fx >= 0.88
         plot.text(
-            p[0], p[1], word, f"note {'end' if outward else ''}", dx=-10 if outward else 10, dy=-8 if on_left else 16
+            p[0], p[1], name, f"note {'end' if outward else ''}", dx=-10 if outward else 10, dy=-8 if on_left else 16
         )
 
 
-def _furniture(plot: Plot) -> None:
-    """Scale bar and north arrow, outside the frame: inside they would cover something on a small screen."""
+def _scale_and_north(plot: Plot) -> None:
+    """Scale bar and north arrow, outside the frame to cover nothing on a small screen."""
     width = plot.x.hi - plot.x.lo
     length = round_step(width / 5, 1) / (1 if round_step(width / 5, 1) < width / 3.5 else 2)
     share, text = 100 * length / width, f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"

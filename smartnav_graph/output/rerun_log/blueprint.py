@@ -1,8 +1,8 @@
-"""The window that opens: only views that have data, in the order in which a recording of its kind is looked at."""
+"""The layout of the viewer: only views that have data, ordered by the kind of recording."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -14,6 +14,12 @@ from smartnav_graph.output.rerun_log.cameras import CameraView
 from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.output.rerun_log.spatial import Extent, nice
 from smartnav_graph.session.session import Session
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+    from rerun.blueprint.archetypes import TextLogColumns
+
+    View: TypeAlias = rrb.View | rrb.Container
 
 Names = tuple[tuple[str, str], ...]
 
@@ -37,14 +43,14 @@ _ACCURACY: Names = (
     ("Position σ m", "/sigma/position"),
     ("Heading σ °", "/sigma/heading"),
 )
-_FOUND: Names = (
+_BIASES: Names = (
     ("Accelerometer bias m/s², bands 1σ 3σ", "/bias/accel"),
     ("Gyroscope bias rad/s, bands 1σ 3σ", "/bias/gyro"),
 )
 _UPDATES: Names = (
     ("Updates: states (latency ms in latency.rrd)", "/update/effort"),
-    ("Correction of the past m", "/update/correction"),
-    ("Rejected rows by update", "/update/rejected"),
+    ("Change of earlier states m", "/update/change"),
+    ("Rejected measurements by update", "/update/rejected"),
 )
 _PAIRS: Names = (("Matches of image pairs", "/pairs/matches"),)
 
@@ -52,13 +58,13 @@ _PAIRS: Names = (("Matches of image pairs", "/pairs/matches"),)
 OPENING_DEG, ASPECT, FILLED = 55.0, 1.6, 0.85
 # A scene too small for a map, m.
 SMALL = 50.0
-# How near the body is looked at, as a share of the scene.
+# Distance of the view behind the body, as a share of the scene.
 NEAR = 0.25
 
 
 def kind_of(recorder: Recorder, session: Session, solution: Solution | None) -> str:
-    """What a recording is looked at for: ``calibration`` (signals without a path), ``session`` (not solved yet),
-    ``vision``, ``car`` (under the sky) or ``indoor``."""
+    """``calibration`` (signals without a path), ``session`` (not solved yet), ``vision``, ``car`` (outdoors) or
+    ``indoor``."""
     if solution is None:
         return "calibration" if not recorder.has("/world") else "session"
     if recorder.has("/pairs") or any("/image" in path for path in recorder.paths):
@@ -76,14 +82,14 @@ def build(
     solution: Solution | None,
     extent: Extent | None,
     factor: float,
-    seen: list[CameraView],
-) -> Any:
-    """Left the path with graph, report, map and cameras; right what is drawn against time. `factor` magnifies the
-    ellipsoids of the path."""
+    views: list[CameraView],
+) -> rrb.Blueprint:
+    """Left the path with graph, report, map and cameras; right the plots over time. `factor` magnifies the ellipsoids
+    of the path."""
     import rerun.blueprint as rrb
 
     kind = kind_of(recorder, session, solution)
-    flat = _row(_flat_views(recorder, session, extent, seen))
+    flat = _row(_flat_views(recorder, session, extent, views))
     left = _stack([_tabs(_scenes(recorder, solution, extent, factor)), flat], [1, 1] if kind == "vision" else [3, 2])
     right = _right(recorder, solution, kind)
     sides = [side for side in (left, right) if side is not None]
@@ -97,7 +103,7 @@ def build(
     )
 
 
-def _stack(parts: list[Any], shares: list[float]) -> Any:
+def _stack(parts: list[View | None], shares: list[float]) -> View | None:
     import rerun.blueprint as rrb
 
     there = [(part, share) for part, share in zip(parts, shares, strict=True) if part is not None]
@@ -106,7 +112,7 @@ def _stack(parts: list[Any], shares: list[float]) -> Any:
     return rrb.Vertical(*(part for part, _ in there), row_shares=[share for _, share in there])
 
 
-def _tabs(views: list[Any]) -> Any:
+def _tabs(views: list[View]) -> View | None:
     import rerun.blueprint as rrb
 
     if len(views) < 2:
@@ -114,7 +120,7 @@ def _tabs(views: list[Any]) -> Any:
     return rrb.Tabs(*views, active_tab=0)
 
 
-def _row(views: list[Any]) -> Any:
+def _row(views: list[View]) -> View | None:
     import rerun.blueprint as rrb
 
     if len(views) < 2:
@@ -122,17 +128,17 @@ def _row(views: list[Any]) -> Any:
     return rrb.Horizontal(*views)
 
 
-def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None, factor: float) -> list[Any]:
+def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None, factor: float) -> list[View]:
     import rerun.blueprint as rrb
 
-    views: list[Any] = []
+    views: list[View] = []
     if extent is not None and recorder.has("/world"):
         name = "Path (ENU)"
         if recorder.has("/world/est/covariances"):
             name += f", 3σ ellipsoids ×{factor:g}"
         views.append(world_view(name, extent, np.array([0.35, 0.62, -0.7]), [0.0, 0.0, 1.0]))
         if solution is not None and recorder.has("/world/est/body"):
-            views.append(_ride(solution, extent))
+            views.append(_behind_body(solution, extent))
     if recorder.has("/graph"):
         (left, top), (right, bottom) = recorder.bounds["/graph"]
         bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
@@ -142,8 +148,8 @@ def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None
     return views
 
 
-def _ride(solution: Solution, extent: Extent) -> Any:
-    """The scene as it passes the body, from behind and above it: with camera, velocity and true uncertainty."""
+def _behind_body(solution: Solution, extent: Extent) -> rrb.Spatial3DView:
+    """The scene from behind and above the moving body: with camera, velocity and the ellipsoid at true size."""
     import rerun.blueprint as rrb
 
     ahead, _, up = frames.body_R_vehicle(solution.forward, solution.up).T
@@ -157,8 +163,8 @@ def _ride(solution: Solution, extent: Extent) -> Any:
     )
 
 
-def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) -> Any:
-    """The scene looked at along `direction` from where everything is in the picture."""
+def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) -> rrb.Spatial3DView:
+    """The scene seen along `direction`, from where everything is visible."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -179,7 +185,7 @@ def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) ->
 
 
 def eye_position(extent: Extent, direction: Floats, up: Floats) -> Floats:
-    """Nearest eye (3,) on the line through the centre along `direction` that has every point in the picture.
+    """Nearest eye (3,) on the line through the centre along `direction` that sees every point.
 
     A point (x, y, z) right of, above and behind the centre is inside where |x| <= a (d + z) and |y| <= b (d + z), with
     d the eye's distance and a, b the tangents of half the opening angles: d is the largest |x| / a - z, |y| / b - z.
@@ -192,13 +198,13 @@ def eye_position(extent: Extent, direction: Floats, up: Floats) -> Floats:
     return np.asarray(extent.centre - ahead * max(distance, 0.5 * extent.size))
 
 
-def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, seen: list[CameraView]) -> list[Any]:
-    views: list[Any] = []
+def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, cameras: list[CameraView]) -> list[View]:
+    views: list[View] = []
     if recorder.has("/geo") and extent is not None and extent.size > SMALL:
         views.append(_map(session, extent))
     elif recorder.has("/world") and extent is not None:
         views.append(world_view("Top view (ENU)", extent, np.array([0.0, 1e-3, -1.0]), [0.0, 1.0, 0.0]))
-    for view in seen:
+    for view in cameras:
         if recorder.has(view.image) or (view.camera is not None and recorder.has(view.points)):
             views.append(_camera(view))
         if view.camera is None and recorder.has(view.origin):
@@ -206,7 +212,7 @@ def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, see
     return views
 
 
-def _camera(view: CameraView) -> Any:
+def _camera(view: CameraView) -> rrb.Spatial2DView:
     """The image of one camera, in pixels."""
     import rerun.blueprint as rrb
 
@@ -217,7 +223,7 @@ def _camera(view: CameraView) -> Any:
     return rrb.Spatial2DView(name=f"Camera {view.name}", origin=view.root, contents=contents, visual_bounds=bounds)
 
 
-def _normalised(view: CameraView, session: Session) -> Any:
+def _normalised(view: CameraView, session: Session) -> rrb.Spatial2DView:
     """Points of a camera without calibration, in normalised image coordinates."""
     import rerun.blueprint as rrb
 
@@ -232,7 +238,7 @@ def _normalised(view: CameraView, session: Session) -> Any:
     )
 
 
-def _map(session: Session, extent: Extent) -> Any:
+def _map(session: Session, extent: Extent) -> rrb.MapView:
     """Zoom so that the path fills most of a map 800 by 260 points (256-point tiles, Web Mercator)."""
     import rerun.blueprint as rrb
 
@@ -244,16 +250,16 @@ def _map(session: Session, extent: Extent) -> Any:
     return rrb.MapView(name="Map", origin="/geo", zoom=zoom, background=rrb.MapProvider.OpenStreetMap)
 
 
-def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
+def _right(recorder: Recorder, solution: Solution | None, kind: str) -> View | None:
     import rerun.blueprint as rrb
 
-    def series(names: Names, first: str = "") -> list[Any]:
+    def series(names: Names, first: str = "") -> list[View]:
         there = [(name, path) for name, path in names if recorder.has(path)]
         there.sort(key=lambda item: item[1] != first)
         return [series_view(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
 
     raw = series(_SIGNALS)
-    # Without a solution there is room to show every signal at once.
+    # Without a solution every signal is shown at once.
     shown = _stack(raw, [2.0] * len(raw)) if solution is None else _tabs(series(_MOTION, _FIRST.get(kind, "")) + raw)
     states = (
         rrb.StateTimelineView(name="States", origin="/status", time_view=_whole()) if recorder.has("/status") else None
@@ -263,7 +269,7 @@ def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
     parts = [
         shown,
         _tabs(series(_ACCURACY)),
-        _tabs(series(_FOUND) + series(_clocks(recorder))),
+        _tabs(series(_BIASES) + series(_clocks(recorder))),
         _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(recorder, solution)]),
         states,
         log,
@@ -273,7 +279,7 @@ def _right(recorder: Recorder, solution: Solution | None, kind: str) -> Any:
 
 
 def _contents(path: str) -> list[str]:
-    # how long an update took, where that recording is there too, beside what it did
+    # with the latency of the updates, where the second recording is open
     return [f"{path}/**", "/update/latency"] if path == "/update/effort" else [f"{path}/**"]
 
 
@@ -282,11 +288,11 @@ def _clocks(recorder: Recorder) -> Names:
     return tuple((f"Clock offset of {sensor} s, bands 1σ 3σ", f"/clock/{sensor}") for sensor in sensors)
 
 
-def _residuals(recorder: Recorder, solution: Solution | None) -> list[Any]:
+def _residuals(recorder: Recorder, solution: Solution | None) -> list[View]:
     if solution is None:
         return []
     sensors = signals.sensors_of(solution.residuals)
-    # Position sensors tell most: they stand first; the inertial residuals are many and small.
+    # Position sensors first: the inertial residuals are many and small.
     sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
         series_view(
@@ -309,7 +315,8 @@ def series_view(
     *,
     legend: bool = True,
     limits: tuple[float, float] | None = None,
-) -> Any:
+) -> rrb.TimeSeriesView:
+    """A plot over the whole recording."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -322,7 +329,7 @@ def series_view(
     )
 
 
-def log_columns() -> Any:
+def log_columns() -> TextLogColumns:
     """Time, level and text: all lines come from one entity."""
     from rerun.blueprint.archetypes import TextLogColumns
     from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
@@ -333,8 +340,8 @@ def log_columns() -> Any:
     )
 
 
-def _whole() -> Any:
-    """The whole recording, on whichever time line is chosen."""
+def _whole() -> rrb.TimeAxis:
+    """The whole recording, on the chosen time line."""
     import rerun as rr
     import rerun.blueprint as rrb
 

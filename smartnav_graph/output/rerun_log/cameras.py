@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,13 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.images import Picture, pictures
 
+if TYPE_CHECKING:
+    import rerun as rr
+
 MEDIA_TYPES = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}
 IMAGE_BYTES = 300_000_000
 BODY = "/world/est/body"
-# The viewer counts pixels from the corner of the first one, a calibration from its centre.
+# The viewer counts pixels from the corner of the first pixel, a calibration from its centre.
 HALF_PIXEL = 0.5
 # Distance of the image from the camera, as a share of the scene.
 FRUSTUM = 0.08
@@ -29,7 +31,7 @@ FRUSTUM = 0.08
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where one camera is drawn: on the body where that has a path, else by itself.
+    """Where one camera is drawn: on the body where there is a path, else alone.
 
     camera : its calibration, where there is one: points are then drawn in pixels, else in normalised coordinates
     """
@@ -44,7 +46,7 @@ class CameraView:
 
     @property
     def origin(self) -> str:
-        """What a view of its points looks at; without a calibration they have no place in the image."""
+        """Origin of a view of its points; without a calibration they are not drawn in the image."""
         return self.root if self.camera is not None else f"/tracks/{self.name}"
 
     @property
@@ -60,7 +62,7 @@ class CameraView:
 
 
 def views(session: Session, on_body: bool) -> list[CameraView]:
-    """The cameras of a session that saw anything, that of its tracks and matches first."""
+    """The cameras of a session that have data, that of its tracks and matches first."""
     main = camera_name(session, session.calibration)
     names = [main] if session.tracks is not None or session.matches is not None else []
     if session.images is not None:
@@ -71,21 +73,21 @@ def views(session: Session, on_body: bool) -> list[CameraView]:
 
 
 def log_cameras(recorder: Recorder, session: Session, found: list[CameraView], size: float, end_ns: int) -> list[str]:
-    """Frusta, images and tracks; sentences on what was left out. `size` of the scene, m."""
+    """Frusta, images and tracks; returns notes on what was left out. `size` of the scene, m."""
     for view in found:
         _log_frustum(recorder, session, view, size)
-    told = _log_images(recorder, session, found, end_ns)
+    notes = _log_images(recorder, session, found, end_ns)
     if found and session.tracks is not None and len(session.tracks):
         _log_tracks(recorder, session, found[0], end_ns)
-    return told
+    return notes
 
 
 def _log_frustum(recorder: Recorder, session: Session, view: CameraView, size: float) -> None:
-    """The camera's place in the body, and the pinhole that it would be without its distortion."""
+    """The camera's mount on the body, and its pinhole model without distortion."""
     import rerun as rr
 
     mount, camera = session.mount(view.name), view.camera
-    there: list[Any] = []
+    there: list[rr.AsComponents] = []
     if view.root.startswith(BODY):
         there.append(rr.Transform3D(translation=mount.body_t, mat3x3=mount.body_R))
     if camera is not None:
@@ -102,20 +104,20 @@ def _log_frustum(recorder: Recorder, session: Session, view: CameraView, size: f
 
 
 def _log_images(recorder: Recorder, session: Session, found: list[CameraView], end_ns: int) -> list[str]:
-    """The files' contents. Of more than IMAGE_BYTES every k-th image is taken, so that a recording stays openable."""
+    """The files' contents. Above IMAGE_BYTES only every k-th image is taken, to limit the size of the recording."""
     if session.images is None or session.pictures is None or not any(session.images.file):
         return []
-    files, told = pictures(session), list[str]()
+    files, notes = pictures(session), list[str]()
     for view in found:
         mine = [picture for picture in files if picture.camera == view.name and picture.file]
         there = [p for p in mine if p.path.suffix.lower() in MEDIA_TYPES and p.path.is_file()]
         step = max(1, -(-sum(p.path.stat().st_size for p in there) // IMAGE_BYTES))
         _send_images(recorder, view.image, there[::step], end_ns)
         if len(there) < len(mine):
-            told.append(f"images: {len(mine) - len(there)} files of {view.name} not shown (no such JPEG or PNG)")
+            notes.append(f"images: {len(mine) - len(there)} files of {view.name} not shown (no such JPEG or PNG)")
         if step > 1:
-            told.append(f"images: every {step}th of {len(there)} of {view.name} shown, to limit the recording's size")
-    return told
+            notes.append(f"images: every {step}th of {len(there)} of {view.name} shown, to limit the recording's size")
+    return notes
 
 
 def _send_images(recorder: Recorder, path: str, shown: list[Picture], end_ns: int) -> None:
@@ -123,13 +125,9 @@ def _send_images(recorder: Recorder, path: str, shown: list[Picture], end_ns: in
 
     for picture in shown:
         media = MEDIA_TYPES[picture.path.suffix.lower()]
-        columns = rr.EncodedImage.columns(blob=[_bytes(picture.path)], media_type=[media])
+        columns = rr.EncodedImage.columns(blob=[picture.path.read_bytes()], media_type=[media])
         recorder.rows(path, [picture.t_ns], columns)
     recorder.clear(path, stops(np.array([picture.t_ns for picture in shown], dtype=np.int64), end_ns))
-
-
-def _bytes(path: Path) -> bytes:
-    return path.read_bytes()
 
 
 def _log_tracks(recorder: Recorder, session: Session, view: CameraView, end_ns: int) -> None:

@@ -1,14 +1,14 @@
-"""Two solutions of one session as one recording: both paths, and how far they are apart along time.
+"""Two solutions of one session as one recording: both paths, and their differences over time.
 
-Entities: /world/first, /world/second (path, now), /world/apart (from the first towards the second, magnified), /world/
-largest; /apart/<quantity> as second less first with the larger sigma of the two as band; /sigma/<run>; /log, whose rows
-lead to the largest differences; /report.
+Entities: /world/first, /world/second (path, now), /world/difference (from the first to the second, magnified), /world/
+largest; /difference/<quantity>, second minus first, with the larger sigma of the two as band; /sigma/<run>; /log with
+the largest differences; /report.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,24 +19,27 @@ from smartnav_graph.output.rerun_log import blueprint, colours, signals
 from smartnav_graph.output.rerun_log.recorder import Clock, Recorder, fingerprint, recording_file
 from smartnav_graph.output.rerun_log.spatial import Extent, extent_around, finite_rows, nice, thinned
 
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
 FIRST, SECOND = colours.ESTIMATE, [255, 160, 60]
-APART = [150, 150, 150]
+DIFFERENCE = [150, 150, 150]
 MOST_LINES = 2000
-# The largest differences that are marked, and the share of the run between them.
+# Number of largest differences that are marked, and the least share of the run between two of them.
 MARKED, MARKED_APART = 5, 0.04
 # Epochs on each side of the largest difference that are selected on the time line.
 AROUND = 5
-# The largest difference is drawn so long, as a share of the scene.
+# Length of the largest difference as drawn, as a share of the scene.
 DRAWN = 0.05
 DEG = float(np.degrees(1.0))
 # Plots: entity, name, components of the difference, factor to the unit, unit, names of the lines.
 ENU, XYZ = ("east", "north", "up"), ("x", "y", "z")
 PLOTS = (
-    ("/apart/position", "Position, second less first, m", POS, 1.0, "m", ENU),
-    ("/apart/heading", "Heading, second less first, °", slice(2, 3), DEG, "°", ("anticlockwise",)),
-    ("/apart/velocity", "Velocity, second less first, m/s", VEL, 1.0, "m/s", ENU),
-    ("/apart/accel_bias", "Accelerometer bias, second less first, m/s²", ACCEL_BIAS, 1.0, "m/s²", XYZ),
-    ("/apart/gyro_bias", "Gyroscope bias, second less first, °/s", GYRO_BIAS, DEG, "°/s", XYZ),
+    ("/difference/position", "Position, second minus first, m", POS, 1.0, "m", ENU),
+    ("/difference/heading", "Heading, second minus first, °", slice(2, 3), DEG, "°", ("anticlockwise",)),
+    ("/difference/velocity", "Velocity, second minus first, m/s", VEL, 1.0, "m/s", ENU),
+    ("/difference/accel_bias", "Accelerometer bias, second minus first, m/s²", ACCEL_BIAS, 1.0, "m/s²", XYZ),
+    ("/difference/gyro_bias", "Gyroscope bias, second minus first, °/s", GYRO_BIAS, DEG, "°/s", XYZ),
 )
 
 
@@ -59,7 +62,7 @@ def write_comparison(
     first, second : the solutions that `comparison` compares
     names : of the two runs, as shown
     clock_epoch : of the session's stamps
-    report_markdown : the table of the differences, shown beside them
+    report_markdown : the table of the differences
 
     Raises
     ------
@@ -82,7 +85,7 @@ def write_comparison(
 
 
 def _log_scene(recorder: Recorder, first: Solution, second: Solution, comparison: Comparison, extent: Extent) -> float:
-    """Both paths, where each run is at the time chosen, and what lies between them; its magnification."""
+    """Both paths, their positions at the chosen time, and the differences; returns the magnification of these."""
     import rerun as rr
 
     recorder.style("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -99,7 +102,9 @@ def _log_scene(recorder: Recorder, first: Solution, second: Solution, comparison
     start = comparison.position[some] - extent.shift
     ends = start + factor * comparison.difference[some][:, POS]
     lines = [*np.stack([start, ends], axis=1).astype(np.float32), ends.astype(np.float32)]
-    recorder.static("/world/apart", rr.LineStrips3D(lines, colors=[*APART, 160], radii=rr.Radius.ui_points(0.7)))
+    recorder.static(
+        "/world/difference", rr.LineStrips3D(lines, colors=[*DIFFERENCE, 160], radii=rr.Radius.ui_points(0.7))
+    )
     return factor
 
 
@@ -121,7 +126,7 @@ def _log_plots(recorder: Recorder, comparison: Comparison, names: tuple[str, str
 
 
 def _log_largest(recorder: Recorder, comparison: Comparison, extent: Extent) -> None:
-    """Where the runs are farthest apart: marks in the scene, and lines of the log that lead there."""
+    """The largest differences: marks in the scene, and lines of the log."""
     import rerun as rr
 
     span = float(comparison.seconds[-1] - comparison.seconds[0])
@@ -134,20 +139,20 @@ def _log_largest(recorder: Recorder, comparison: Comparison, extent: Extent) -> 
         points, colors=colours.REJECTED, radii=rr.Radius.ui_points(4.0), labels=labels, show_labels=True
     )
     recorder.static("/world/largest", marks)
-    told = [
+    lines = [
         (comparison.t_ns[row], f"{i + 1}. at {t:.2f} s: {m:.3f} m, heading {d:.3f} deg")
         for i, (row, t, m, d) in enumerate(zip(rows, seconds, metres, turns, strict=True))
     ]
-    told.sort(key=lambda line: line[0])
+    lines.sort(key=lambda line: line[0])
     recorder.rows(
-        "/log", [t for t, _ in told], rr.TextLog.columns(text=[text for _, text in told], level=["INFO"] * len(told))
+        "/log", [t for t, _ in lines], rr.TextLog.columns(text=[text for _, text in lines], level=["INFO"] * len(lines))
     )
 
 
 def _blueprint(
     recorder: Recorder, comparison: Comparison, names: tuple[str, str], extent: Extent, factor: float
-) -> Any:
-    """The paths and the largest differences on the left, differences along time on the right."""
+) -> rrb.Blueprint:
+    """The paths and the largest differences on the left, differences over time on the right."""
     import rerun.blueprint as rrb
     from rerun.encodings import AbsoluteTimeRange
 

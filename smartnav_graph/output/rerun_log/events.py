@@ -1,10 +1,9 @@
-"""What happened when: gaps, outages, standstills, rejected fixes. Arrays in, spans out; nothing of Rerun here."""
+"""Gaps, outages, standstills and rejected fixes as time spans; without Rerun."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +11,20 @@ from numpy.typing import NDArray
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.timebase import NS, Gap, find_gaps, nearest, ns_from_seconds
 from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.output import summary_json
+from smartnav_graph.output.summary_json import Summary, standstill_spans
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
 USED, REJECTED, WITHHELD = 0, 1, 2
+GAP_KINDS = {"bridged": "interpolated"}  # others as they are
 
 
 @dataclass(frozen=True)
 class Events:
-    """Stretches in which something is missing or stands still, and what became of every row that tells a position.
+    """Time spans of gaps, outages and standstills, and the use of every row of positions.
 
-    use : by stream, (n,) USED, REJECTED, or WITHHELD (it has no residual: kept back, or outside the solution).
+    use : by stream, (n,) USED, REJECTED, or WITHHELD (no residual: withheld, or outside the solution).
     """
 
     start_ns: int
@@ -33,8 +35,8 @@ class Events:
     use: Mapping[str, NDArray[np.int64]]
 
 
-def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]) -> Events:
-    """Everything a session, its solution and its summary tell of stretches of time."""
+def find(session: Session, solution: Solution | None, summary: Summary) -> Events:
+    """The events of a session, its solution and its summary."""
     start, end = span(session, solution)
     use = {name: fix_use(stream, solution) for name, stream in session.absolute().items()}
     fixes = session.gnss.t_ns[use["gnss"] == USED] if session.gnss is not None else np.zeros(0, dtype=np.int64)
@@ -42,25 +44,25 @@ def find(session: Session, solution: Solution | None, summary: Mapping[str, Any]
         start_ns=start,
         end_ns=end,
         gaps=imu_gaps(session, summary),
-        outages=silences(fixes, start, end) if session.gnss is not None else [],
+        outages=outages(fixes, start, end) if session.gnss is not None else [],
         standstills=_standstills(session, summary),
         use=use,
     )
 
 
-def _standstills(session: Session, summary: Mapping[str, Any]) -> list[Gap]:
-    """Standstills as the estimator told them, else as they are listed."""
+def _standstills(session: Session, summary: Summary) -> list[Gap]:
+    """Standstills of the summary, else those listed in the session."""
     if "standstills" in summary:
-        spans = ns_from_seconds(np.array(summary["standstills"].get("spans_s", [])).reshape(-1, 2)) + session.t0_ns
+        spans = ns_from_seconds(np.array(standstill_spans(summary)).reshape(-1, 2)) + session.t0_ns
     elif session.static is not None:
         spans = np.stack([session.static.t_ns, session.static.t_end_ns], axis=1)
     else:
         return []
-    return [Gap(int(a), int(b), "still") for a, b in spans]
+    return [Gap(int(a), int(b), "standstill") for a, b in spans]
 
 
 def span(session: Session, solution: Solution | None) -> tuple[int, int]:
-    """First and last stamp of everything that is drawn along time."""
+    """First and last stamp of the session and its solution."""
     times = [stream.t_ns for name, stream in session.streams().items() if name != "reference" and len(stream)]
     times += [solution.t_ns] if solution is not None and len(solution) else []
     if not times:
@@ -68,25 +70,26 @@ def span(session: Session, solution: Solution | None) -> tuple[int, int]:
     return min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
 
 
-def imu_gaps(session: Session, summary: Mapping[str, Any]) -> list[Gap]:
-    """Gaps as the estimator told them, else as they stand in the inertial stream."""
+def imu_gaps(session: Session, summary: Summary) -> list[Gap]:
+    """IMU data gaps of the summary, else those found in the inertial stream."""
     if "gaps" in summary:
-        spans = [(g["start_s"], g["length_s"], str(g["kind"])) for g in summary["gaps"]]
-        starts = ns_from_seconds([s[0] for s in spans]) + session.t0_ns
-        return [
-            Gap(int(t), int(t + ns_from_seconds(length)), kind)
-            for t, (_, length, kind) in zip(starts, spans, strict=True)
+        gaps = summary_json.imu_gaps(summary)
+        starts = ns_from_seconds([gap.start_s for gap in gaps]) + session.t0_ns
+        found = [
+            Gap(int(t), int(t + ns_from_seconds(gap.length_s)), gap.kind) for t, gap in zip(starts, gaps, strict=True)
         ]
-    if session.imu is None:
-        return []
-    return find_gaps(session.imu.t_ns, np.concatenate([session.imu.gyro, session.imu.accel], axis=1))
+    elif session.imu is None:
+        found = []
+    else:
+        found = find_gaps(session.imu.t_ns, np.concatenate([session.imu.gyro, session.imu.accel], axis=1))
+    return [replace(gap, kind=GAP_KINDS.get(gap.kind, gap.kind)) for gap in found]
 
 
 def fix_use(fixes: Stream, solution: Solution | None) -> NDArray[np.int64]:
     """USED, REJECTED or WITHHELD for every row of positions, by the residual nearest in time (n,).
 
-    Residuals may stand on the inertial clock and fixes on the receiver's, a time offset apart: a residual belongs to
-    a fix within 0.4 fix periods.
+    Residuals may be on the IMU clock and fixes on the receiver's, with a time offset between them: a residual belongs
+    to a fix within 0.4 fix periods.
     """
     use = np.full(len(fixes), USED, dtype=np.int64)
     rows: Residuals | None = None if solution is None else solution.residuals
@@ -104,24 +107,24 @@ def fix_use(fixes: Stream, solution: Solution | None) -> NDArray[np.int64]:
     return use
 
 
-def silences(t_ns: Times, start_ns: int, end_ns: int, *, periods: float = 3.0, least_s: float = 1.0) -> list[Gap]:
-    """Stretches of [start, end] without a sample for longer than `periods` median periods and `least_s`."""
+def outages(t_ns: Times, start_ns: int, end_ns: int, *, periods: float = 3.0, least_s: float = 1.0) -> list[Gap]:
+    """Spans of [start, end] without a sample for longer than `periods` median periods and `least_s`."""
     limit = max(least_s * NS, periods * float(np.median(np.diff(t_ns)))) if len(t_ns) > 1 else least_s * NS
     edges = np.concatenate([[start_ns], t_ns, [end_ns]]).astype(np.int64)
     return [Gap(int(edges[i]), int(edges[i + 1]), "outage") for i in np.flatnonzero(np.diff(edges) > limit)]
 
 
 def stops(t_ns: Times, end_ns: int) -> Times:
-    """When a stream fell silent: one median period after each last sample before a silence."""
+    """Ends of a stream's data: one median period after the last sample before each outage."""
     if not len(t_ns):
         return t_ns
     period = int(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0
-    quiet = silences(t_ns, int(t_ns[0]), end_ns, least_s=0.05)
+    quiet = outages(t_ns, int(t_ns[0]), end_ns, least_s=0.05)
     return np.array([gap.start_ns + min(period, (gap.end_ns - gap.start_ns) // 2) for gap in quiet], dtype=np.int64)
 
 
 def switches(start_ns: int, spans: list[Gap], between: str) -> tuple[Times, list[str]]:
-    """Times and names of a state that is `between` outside the spans and the span's kind inside."""
+    """Times and names of a status that is `between` outside the spans and the span's kind inside."""
     at: dict[int, str] = {start_ns: between}
     for gap in spans:
         at.setdefault(gap.end_ns, between)

@@ -1,4 +1,4 @@
-"""The factor graph around each keyframe: the last few keyframes, their states, and the factors between them."""
+"""The factor graph near each keyframe: the last few keyframes, their states, and the factors between them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from smartnav_graph.graph.states import STATES
 from smartnav_graph.output.rerun_log import colours
 from smartnav_graph.output.rerun_log.recorder import Recorder
 
-# Keyframes shown at a time, and moments shown at most.
+# Keyframes shown at a time, and epochs shown at most.
 DEPTH = 4
-MOST_MOMENTS = 500
-# Places, in the view's points: between keyframes, between states, of the first factor above a keyframe and beside it,
-# of session states below it.
+MOST_EPOCHS = 500
+# Distances, in points of the view: between keyframes, between states, of the first factor above a keyframe and beside
+# it, of session states below it.
 COLUMN, ROW, ABOVE, ASIDE, BELOW = 190.0, 75.0, -95.0, 60.0, 90.0
 MARGIN = 60.0
 EARLIER = "earlier"
@@ -28,7 +28,7 @@ State = tuple[str, int]
 
 @dataclass
 class Picture:
-    """One moment: nodes with label, place and colour; edges between them."""
+    """The graph at one epoch: nodes with label, place and colour; edges between them."""
 
     ids: list[str] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
@@ -43,16 +43,16 @@ class Picture:
         self.colors.append(color)
 
 
-def log_graph(recorder: Recorder, trace: Diagnostics) -> None:
+def log_graph(recorder: Recorder, diagnostics: Diagnostics) -> None:
     """/graph: nodes and edges at evenly taken keyframes."""
     import rerun as rr
 
-    count = len(trace.keyframe_ns)
-    moments = np.unique(np.linspace(0, count - 1, min(count, MOST_MOMENTS)).astype(int))
-    pictures = list(_pictures(trace.layout, moments))
+    count = len(diagnostics.keyframe_ns)
+    epochs = np.unique(np.linspace(0, count - 1, min(count, MOST_EPOCHS)).astype(int))
+    pictures = list(_pictures(diagnostics.layout, epochs))
     if not any(picture.edges for picture in pictures):
         return
-    times = trace.keyframe_ns[moments]
+    times = diagnostics.keyframe_ns[epochs]
     places = np.array([place for picture in pictures for place in picture.places], dtype=np.float32)
     nodes = rr.GraphNodes.columns(
         node_ids=[name for picture in pictures for name in picture.ids],
@@ -70,15 +70,15 @@ def log_graph(recorder: Recorder, trace: Diagnostics) -> None:
     recorder.style("/graph", rr.GraphEdges.from_fields(graph_type="undirected"))
 
 
-def _pictures(layout: FactorGraphLayout, moments: NDArray[np.intp]) -> Iterator[Picture]:
-    """The last DEPTH keyframes at each moment."""
+def _pictures(layout: FactorGraphLayout, epochs: NDArray[np.intp]) -> Iterator[Picture]:
+    """The last DEPTH keyframes at each epoch."""
     touched, newest = _touched(layout)
     ending: dict[int, list[int]] = defaultdict(list)
     for factor, keyframe in enumerate(newest):
         ending[keyframe].append(factor)
-    for moment in moments.tolist():
-        first = max(0, moment - DEPTH + 1)
-        factors = [factor for keyframe in range(first, moment + 1) for factor in ending[keyframe]]
+    for epoch in epochs.tolist():
+        first = max(0, epoch - DEPTH + 1)
+        factors = [factor for keyframe in range(first, epoch + 1) for factor in ending[keyframe]]
         yield picture_of([(str(layout.sensor[f]), touched[f]) for f in factors], first)
 
 
@@ -96,7 +96,7 @@ def _touched(layout: FactorGraphLayout) -> tuple[list[list[State]], list[int]]:
 
 
 def picture_of(factors: Sequence[tuple[str, list[State]]], first: int) -> Picture:
-    """Factors (builder, states) with the states they touch; keyframes before `first` stand together as one node."""
+    """Factors (builder, states) with the states they touch; keyframes before `first` are one node."""
     picture = Picture()
     states = sorted({state for _, touched in factors for state in touched}, key=_order)
     places: dict[State, tuple[float, float]] = {}
@@ -125,7 +125,7 @@ def _add_factor(
     places: dict[State, tuple[float, float]],
     slots: dict[float, int],
 ) -> None:
-    """Between the keyframes that it joins, where it is inertial, else above the last that it speaks of."""
+    """An inertial factor between its keyframes, any other above its last one."""
     own = [places.get(state, (-COLUMN, ROW)) for state in touched if not _shared(state)]
     columns = sorted({x for x, _ in own}) or [0.0]
     if sensor.startswith("imu") and len(columns) == 2:

@@ -1,4 +1,4 @@
-"""Image pairs: matches over the second image, told apart by what became of them; how many there are along time."""
+"""Image pairs: matches drawn on the second image, coloured by their use; their number over time."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.pairs import pairs_of_matches
 
-# A pair for show: matched, not yet judged.
-UNJUDGED = len(REASONS)
+# A pair that was matched but not tested.
+UNTESTED = len(REASONS)
 
 
-def image_pairs(session: Session, trace_pairs: ImagePairs | None) -> ImagePairs | None:
-    """The pairs of a run; of a session alone those that were matched, not judged."""
-    if trace_pairs is not None or session.matches is None:
-        return trace_pairs
+def image_pairs(session: Session, of_run: ImagePairs | None) -> ImagePairs | None:
+    """The pairs of a run; of a session alone those that were matched, not tested."""
+    if of_run is not None or session.matches is None:
+        return of_run
     pairs = pairs_of_matches(session.matches)
     everything = np.ones(len(pairs.pair), dtype=bool)
-    return ImagePairs(pairs, everything, np.full(len(pairs), UNJUDGED, dtype=np.intp))
+    return ImagePairs(pairs, everything, np.full(len(pairs), UNTESTED, dtype=np.intp))
 
 
 def shown(seen: ImagePairs) -> NDArray[np.intp]:
@@ -36,7 +36,7 @@ def shown(seen: ImagePairs) -> NDArray[np.intp]:
 
 
 def log_pairs(recorder: Recorder, view: CameraView, seen: ImagePairs, end_ns: int) -> None:
-    """Arrows from where a point was in the first image to where it is in the second; counts; the verdicts as states."""
+    """Arrows from a point in the first image to the same in the second; counts; the use of each pair as status."""
     import rerun as rr
 
     if not len(seen.pairs):
@@ -53,21 +53,21 @@ def log_pairs(recorder: Recorder, view: CameraView, seen: ImagePairs, end_ns: in
     recorder.rows(path, times, columns.partition(seen.pairs.count[rows]))
     recorder.style(path, rr.Arrows2D.from_fields(radii=rr.Radius.ui_points(0.6)))
     recorder.clear(path, stops(times, end_ns))
-    if not (seen.verdict == UNJUDGED).all():
+    if not (seen.verdict == UNTESTED).all():
         _log_counts(recorder, seen, rows, times)
 
 
 def _colours(seen: ImagePairs, rows: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """Of matches: in use, refused in a pair in use, of a pair that is not used for another reason, not judged."""
+    """Of matches: in use, rejected, of a pair that is not used for another reason, not tested."""
     verdict, use = seen.verdict[seen.pairs.pair[rows]], seen.use[rows]
     bad = ((verdict == IN_USE) & ~use) | (verdict == CONTRARY)
-    kind = np.select([verdict == UNJUDGED, bad, verdict == IN_USE], [3, 1, 0], 2)
+    kind = np.select([verdict == UNTESTED, bad, verdict == IN_USE], [3, 1, 0], 2)
     palette = np.array([colours.MATCH, colours.OUTLIER, colours.UNUSED, colours.NEUTRAL], dtype=np.uint8)
     return np.asarray(palette[kind])
 
 
 def _log_counts(recorder: Recorder, seen: ImagePairs, rows: NDArray[np.intp], times: NDArray[np.int64]) -> None:
-    """Matches in use and refused of each pair shown, and why pairs are not used."""
+    """Matches in use and not in use of each pair shown, and why pairs are not used."""
     import rerun as rr
 
     inside = seen.verdict == IN_USE

@@ -1,4 +1,4 @@
-"""One open recording: the time lines every row carries, and which entities hold data."""
+"""An open recording: the time lines of its rows, and the entities that have data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,11 +17,14 @@ from smartnav_graph.core.arrays import Times
 from smartnav_graph.estimate.result.diagnostics import window_of
 from smartnav_graph.output.rerun_log import colours
 
+if TYPE_CHECKING:
+    import rerun as rr
+
 APPLICATION = "smartnav_graph"
-# Numbers at the axis of a small plot before they run into each other.
+# Most tick labels of a small plot.
 MOST_NUMBERS = 6.5
-# How many times larger than what it shows a plot may be for the sake of a second number.
-MOST_ROOM = 1.7
+# How many times larger than its data the range of a plot may become for a second tick label.
+MOST_ENLARGED = 1.7
 
 # Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
 _LEAP_DAYS = (
@@ -42,12 +45,12 @@ def utc_from_gps(t_ns: Times) -> Times:
 
 @dataclass(frozen=True)
 class Clock:
-    """Stamps of a session -> the index columns `elapsed`, `utc` or `device`, and `keyframe`.
+    """Index columns of stamps: `elapsed`, `utc` or `device`, and `keyframe`.
 
     `elapsed` counts from the session's time zero. `utc` exists where the session's clock is a date (unix, gps), else
-    `device` holds the raw reading. A "gps" or "unix" clock that reads before the year 2000 counts seconds of a week
-    or a day: it is no date. `keyframe` numbers the window between keyframes (`keyframe_ns` (n,)) that a stamp lies in
-    by the keyframe at its end; without keyframes there is no such time line.
+    `device` holds the raw reading. A "gps" or "unix" clock before the year 2000 counts seconds of a week or a day: it
+    is no date. `keyframe` is the keyframe (`keyframe_ns` (n,)) at the end of the window of a stamp; without keyframes
+    there is no such time line.
     """
 
     t0_ns: int
@@ -63,7 +66,7 @@ class Clock:
         """Unix nanoseconds of stamps of a unix or gps clock."""
         return utc_from_gps(t_ns) if self.epoch == "gps" else t_ns
 
-    def columns(self, t_ns: ArrayLike) -> list[Any]:
+    def columns(self, t_ns: ArrayLike) -> list[rr.TimeColumn]:
         """Index columns for rows at `t_ns` (n,)."""
         import rerun as rr
 
@@ -80,35 +83,35 @@ class Clock:
 
 @dataclass
 class Recorder:
-    """Writes columns and static data, and remembers the entities, so that the blueprint shows only what is there.
+    """Writes columns and static data, and remembers the entities for the blueprint.
 
-    `limits` keeps a plot's value range where the viewer's own choice would cut off the bands, `bounds` the lower and
-    upper corner (2, 2) of a flat drawing.
+    `limits` is the value range of plots with bands, which the viewer would cut off; `bounds` the lower and upper corner
+    (2, 2) of a 2D drawing.
     """
 
-    stream: Any
+    stream: rr.RecordingStream
     clock: Clock
     paths: set[str] = field(default_factory=set)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    bounds: dict[str, NDArray[np.floating[Any]]] = field(default_factory=dict)
+    bounds: dict[str, NDArray[np.floating]] = field(default_factory=dict)
 
-    def static(self, path: str, *archetypes: Any) -> None:
-        """Data that holds at all times."""
+    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
+        """Data valid at all times."""
         self.stream.log(path, *archetypes, static=True, strict=True)
         self.paths.add(path)
 
-    def style(self, path: str, *archetypes: Any) -> None:
+    def style(self, path: str, *archetypes: rr.AsComponents) -> None:
         """Static colours and names of an entity whose data are rows; once an entity, as two would come in any order."""
         self.stream.log(path, *archetypes, static=True, strict=True)
 
-    def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[Any]) -> None:
+    def rows(self, path: str, t_ns: ArrayLike, columns: Iterable[rr.ComponentColumn]) -> None:
         """One row a time stamp; nothing is written without rows."""
         if len(np.asarray(t_ns)):
             self.stream.send_columns(path, self.clock.columns(t_ns), columns, strict=True)
             self.paths.add(path)
 
     def states(self, path: str, t_ns: ArrayLike, states: Sequence[str]) -> None:
-        """What state something is in from each stamp on; only changes are written."""
+        """A status from each stamp on; only changes are written."""
         import rerun as rr
 
         t = np.asarray(t_ns, dtype=np.int64)
@@ -119,12 +122,12 @@ class Recorder:
         self.style(path, rr.StateConfiguration(values=values, labels=values, colors=colors))
 
     def name(self, device: str, identity: str) -> None:
-        """What the viewer lists the recording as: device, date where the clock is one, and a bit of the identity."""
+        """The name of the recording in the viewer: device, date where known, and the first digits of the identity."""
         day = f", {np.datetime64(int(self.clock.utc(np.array([self.clock.t0_ns]))[0]), 'ns').astype('datetime64[m]')}"
         self.stream.send_recording_name(f"{device}{day if self.clock.is_date else ''}, {identity[:6]}")
 
     def clear(self, path: str, t_ns: ArrayLike) -> None:
-        """End what an entity shows at these times: a stream that stops must not be joined by a line."""
+        """End the data of an entity at these times: no line may connect the two sides of an outage."""
         import rerun as rr
 
         t = np.asarray(t_ns, dtype=np.int64)
@@ -133,7 +136,7 @@ class Recorder:
             self.stream.send_columns(path, self.clock.columns(t), cleared, strict=True)
 
     def widen(self, path: str, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Let a plot reach from `low` to `high`, but for their extreme half percent."""
+        """Extend the range of a plot to `low` and `high`, without their extreme half percent."""
         if not (np.isfinite(low).any() and np.isfinite(high).any()):
             return
         bottom, top = float(np.nanpercentile(low, 0.5)), float(np.nanpercentile(high, 99.5))
@@ -141,28 +144,28 @@ class Recorder:
             self.limits[path] = readable(bottom, top)
 
     def has(self, prefix: str) -> bool:
-        """Whether this entity, or one below it, holds data."""
+        """Whether this entity, or one below it, has data."""
         return any(path == prefix or path.startswith(prefix + "/") for path in self.paths)
 
 
 def readable(low: float, high: float) -> tuple[float, float]:
-    """A value range with a margin, in which two numbers stand at the axis: a small plot has them at steps of powers of
-    ten. Without them where that would leave it half empty."""
+    """A value range with a margin and two tick labels, which a small plot has at steps of powers of ten; without the
+    second label where the plot would be half empty."""
     margin = 0.03 * (high - low)
     step = 10.0 ** np.ceil(np.log10((high - low + 2 * margin) / MOST_NUMBERS))
     bottom, top = low - margin, high + margin
     while np.floor(top / step) - np.ceil(bottom / step) < 1:
         above, below = step - top % step, bottom % step or step
-        # a number on the very edge would be cut off
+        # a label on the edge would be cut off
         bottom, top = (bottom, top + above + margin) if above <= below else (bottom - below - margin, top)
-        if top - bottom > MOST_ROOM * (high - low):
+        if top - bottom > MOST_ENLARGED * (high - low):
             return low - margin, high + margin
     return float(bottom), float(top)
 
 
 @contextmanager
-def recording_file(path: Path, recording_id: str) -> Iterator[Any]:
-    """A stream into the file `path` that carries no wall-clock time: the same data give the same recording.
+def recording_file(path: Path, recording_id: str) -> Iterator[rr.RecordingStream]:
+    """A stream into the file `path` without wall-clock time: the same data give the same recording.
 
     Raises
     ------
@@ -171,7 +174,7 @@ def recording_file(path: Path, recording_id: str) -> Iterator[Any]:
     """
     import rerun as rr
 
-    # The default cuts static rows into chunks by a wall-clock tick.
+    # the default divides static rows into chunks by wall-clock time
     never = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=never)
     stream.save(path)
@@ -184,21 +187,25 @@ def recording_file(path: Path, recording_id: str) -> Iterator[Any]:
         stream.disconnect()
 
 
-def _finish(stream: Any, path: Path) -> None:
-    """End the file and make sure that all of it is there: a thread writes it, which does not tell of a full disk."""
+def _finish(stream: rr.RecordingStream, path: Path) -> None:
+    """Close the file and check that it is complete: the thread that writes it does not report a full disk."""
     from rerun.chunk import RrdReader
 
     try:
         stream.flush()
         stream.disconnect()
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a missing footer is only warned of
+            warnings.simplefilter("error")  # a missing footer gives only a warning
             RrdReader(path).recordings()
     except (RuntimeError, Warning) as error:
         raise OSError(f"the recording is not complete: {error}") from error
 
 
-def fingerprint(*parts: Any) -> str:
+class _Digest(Protocol):
+    def update(self, data: bytes, /) -> None: ...
+
+
+def fingerprint(*parts: object) -> str:
     """Hexadecimal digest of the numbers and texts in arrays, dataclasses, mappings and sequences."""
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
@@ -206,7 +213,7 @@ def fingerprint(*parts: Any) -> str:
     return digest.hexdigest()
 
 
-def _feed(digest: Any, part: Any) -> None:
+def _feed(digest: _Digest, part: object) -> None:
     if isinstance(part, np.ndarray) and part.dtype != object:
         digest.update(f"{part.dtype.str}{part.shape}".encode())
         digest.update(np.ascontiguousarray(part).tobytes())

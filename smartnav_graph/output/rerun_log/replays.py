@@ -1,7 +1,7 @@
-"""A replay as it went: the window of the moment over the path, the effort of each update, what it corrected.
+"""A replay: causal path, current window, effort of each update, change of earlier states.
 
-How long an update took differs from run to run. It stands in a recording of its own, with the same identity, which the
-viewer joins to the first: two runs of the same session then have equal recordings, and latency is still there to see.
+The latency of updates differs from run to run. It is in a second recording with the same identity, which the viewer
+joins to the first: two runs of the same session then have equal recordings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_WINDOWS, MOST_POINTS = 2000, 60
 
 
 def log_causal(scene: Scene, causal: Solution, updates: Updates | None) -> None:
-    """The path of what was known at each moment, its latest point, and the window that the moment corrects."""
+    """The causal path, its latest point, and the window of each update."""
     import rerun as rr
 
     scene.path("causal", causal.nav_t_body, colours.CAUSAL, 1.2)
@@ -37,7 +37,7 @@ def log_causal(scene: Scene, causal: Solution, updates: Updates | None) -> None:
 
 
 def _log_windows(scene: Scene, updates: Updates) -> None:
-    """The keyframes that each update could still move, as it left them."""
+    """The keyframes that each update can change, after the update."""
     import rerun as rr
 
     count = len(updates.t_ns)
@@ -55,7 +55,7 @@ def _some(start: int, end: int) -> NDArray[np.intp]:
 
 
 def log_updates(recorder: Recorder, updates: Updates) -> None:
-    """Effort, correction and doubts of each update, and the session states as it has them."""
+    """Effort, rejections and change of earlier states of each update."""
     import rerun as rr
 
     t = updates.t_ns
@@ -66,11 +66,11 @@ def log_updates(recorder: Recorder, updates: Updates) -> None:
     some = updates.doubted > 0
     recorder.rows("/update/rejected", t[some], rr.Scalars.columns(scalars=updates.doubted[some].astype(np.float64)))
     style = rr.SeriesPoints(
-        colors=colours.REJECTED, names="rows rejected or doubted", markers="cross", marker_sizes=3.0
+        colors=colours.REJECTED, names="rejected or downweighted rows", markers="cross", marker_sizes=3.0
     )
     recorder.style("/update/rejected", style)
-    recorder.rows("/update/correction", t, rr.Scalars.columns(scalars=updates.corrected))
-    recorder.style("/update/correction", rr.SeriesLines(colors=colours.WINDOW, names="correction of the past"))
+    recorder.rows("/update/change", t, rr.Scalars.columns(scalars=updates.corrected))
+    recorder.style("/update/change", rr.SeriesLines(colors=colours.WINDOW, names="change of earlier states"))
 
 
 def log_latency(recorder: Recorder, updates: Updates) -> None:

@@ -1,18 +1,19 @@
-"""Everything drawn against time: inertial and other signals, biases, sigmas, errors, residuals."""
+"""Plots over time: inertial and other signals, motion, biases, sigmas, errors, residuals."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solution
 from smartnav_graph.output.rerun_log import colours
 from smartnav_graph.output.rerun_log.events import stops
 from smartnav_graph.output.rerun_log.recorder import Recorder, readable
 from smartnav_graph.session.session import Session
+from smartnav_graph.session.stream import Stream
 
 MARKER_SIZE = 2.0
 MANY = 500
@@ -21,7 +22,7 @@ EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
 
 def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
     """Raw signals, in body axes and SI units (magnetic field uT, pressure hPa, temperature deg C)."""
-    columns: list[tuple[str, Any, str]] = [
+    columns: list[tuple[str, Stream | None, str]] = [
         ("/imu/accel", session.imu, "accel"),
         ("/imu/gyro", session.imu, "gyro"),
         ("/magnetometer", session.magnetometer, "field_ut"),
@@ -37,7 +38,7 @@ def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
             recorder.clear(path, stops(stream.t_ns, end_ns))
 
 
-def _log_lines(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, names: list[str]) -> None:
+def _log_lines(recorder: Recorder, path: str, t_ns: Times, values: Floats, names: list[str]) -> None:
     import rerun as rr
 
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
@@ -47,7 +48,7 @@ def _log_lines(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: F
 def log_bands(
     recorder: Recorder,
     path: str,
-    t_ns: NDArray[np.int64],
+    t_ns: Times,
     values: Floats,
     sigmas: Floats,
     names: list[str],
@@ -71,8 +72,8 @@ def log_bands(
     recorder.widen(path, values - 3.0 * sigmas, values + 3.0 * sigmas)
 
 
-def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -> None:
-    """Biases with their bands; the error with its bands where a reference is known, else the sigma itself."""
+def log_states(recorder: Recorder, solution: Solution, evaluation: Evaluation | None) -> None:
+    """Biases with their bands, sigmas, and with a reference the error with its bands."""
     sigma, t = solution.sigmas, solution.t_ns
     axes = ["x", "y", "z"]
     log_bands(recorder, "/bias/accel", t, solution.accel_bias, sigma[:, ACCEL_BIAS], axes, "m/s²")
@@ -86,7 +87,7 @@ def log_states(recorder: Recorder, solution: Solution, evaluation: Any | None) -
 
 
 def log_motion(recorder: Recorder, solution: Solution) -> None:
-    """Speed, height, heading, pitch and roll: what the path is made of."""
+    """Speed, height, heading, pitch and roll."""
     import rerun as rr
 
     t, angles = solution.t_ns, solution.heading_pitch_roll_deg
@@ -94,27 +95,23 @@ def log_motion(recorder: Recorder, solution: Solution) -> None:
     _log_lines(recorder, "/motion/speed", t, speed, ["speed"])
     _log_lines(recorder, "/motion/height", t, solution.nav_t_body[:, 2:], ["up"])
     _log_lines(recorder, "/motion/attitude/tilt", t, angles[:, 1:], ["pitch", "roll"])
-    # points: a line would run through the whole picture where north is passed
+    # points: a line would cross the whole plot where the heading passes north
     recorder.rows("/motion/attitude/heading", t, rr.Scalars.columns(scalars=angles[:, :1]))
     style = rr.SeriesPoints(colors=colours.AXES[2], names="heading", markers="circle", marker_sizes=1.5)
     recorder.style("/motion/attitude/heading", style)
 
 
-def _log_error(recorder: Recorder, evaluation: Any) -> None:
-    t, error = np.asarray(evaluation.t_ns), np.asarray(evaluation.error_enu_m)
-    sigma, names = getattr(evaluation, "sigma_enu", None), ["east", "north", "up"]
-    if sigma is None:
-        _log_lines(recorder, "/error/position", t, error, names)
-    else:
-        log_bands(recorder, "/error/position", t, error, np.asarray(sigma), names, "m")
-    rotation = getattr(evaluation, "rotation_error_deg", None)
-    if rotation is not None and np.isfinite(rotation).any():
+def _log_error(recorder: Recorder, evaluation: Evaluation) -> None:
+    t, names = evaluation.t_ns, ["east", "north", "up"]
+    log_bands(recorder, "/error/position", t, evaluation.error_enu_m, evaluation.sigma_enu, names, "m")
+    rotation = evaluation.rotation_error_deg
+    if rotation is not None:
         known = np.isfinite(rotation)
-        _log_lines(recorder, "/error/rotation", t[known], np.asarray(rotation)[known, None], ["rotation"])
+        _log_lines(recorder, "/error/rotation", t[known], rotation[known, None], ["rotation"])
 
 
 class Marks(NamedTuple):
-    """How the points of each axis are drawn: names and colours of the axes, shape and size of all."""
+    """Style of points: names and colours of the axes, shape and size of all."""
 
     names: list[str]
     colors: list[list[int]]
@@ -122,11 +119,11 @@ class Marks(NamedTuple):
     size: float
 
     def of(self, axis: int) -> Marks:
-        """Those of one axis."""
+        """The style of one axis."""
         return self._replace(names=self.names[axis : axis + 1], colors=self.colors[axis : axis + 1])
 
 
-def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[NDArray[np.int64], Floats]:
+def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[Times, Floats]:
     """Times (n,) and whitened residuals (n, axes) of one sensor; NaN where an axis has none.
 
     Several residuals of one axis at one time (many matches of an image pair) become rows with the same time.
@@ -153,14 +150,14 @@ def sensors_of(residuals: Residuals) -> list[str]:
 
 
 def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
-    """Whitened residuals a sensor: /residuals/<sensor>, and what was not used at /residuals/<sensor>/rejected."""
+    """Whitened residuals by sensor: /residuals/<sensor>, and those not used at /residuals/<sensor>/rejected."""
     for sensor in sensors_of(residuals):
         path = f"/residuals/{sensor}"
         used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
         width = used[1].shape[1]
         names = [axis_name(k, width) for k in range(width)]
         _log_axes(recorder, path, *used, Marks(names, colours.of_axes(width), "circle", MARKER_SIZE))
-        # crosses, small ones where there are so many that they would cover all else
+        # crosses, small ones where many would cover the rest
         size = (2.5 if len(rejected[0]) < MANY else 1.2) * MARKER_SIZE
         crosses = Marks(["rejected ×"] * width, [colours.REJECTED] * width, "cross", size)
         _log_axes(recorder, f"{path}/rejected", *rejected, crosses)
@@ -170,7 +167,7 @@ def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
 
 
 def _limit(used: Floats, rejected: Floats) -> float:
-    """How far a plot of residuals reaches: what is used must still be seen where what was rejected is large."""
+    """The range of a plot of residuals: used ones must be visible beside large rejected ones."""
     inside = float(np.nanpercentile(used, 99.9)) if np.isfinite(used).any() else 3.0
     return max(1.2 * inside, min(1.1 * float(np.nanpercentile(rejected, 75)), 5.0 * inside))
 
@@ -178,12 +175,12 @@ def _limit(used: Floats, rejected: Floats) -> float:
 def _log_axes(
     recorder: Recorder,
     path: str,
-    t_ns: NDArray[np.int64],
+    t_ns: Times,
     values: Floats,
     marks: Marks,
 ) -> None:
-    """Points of all axes in one entity, or each in its own where rows have not the same axes: two recordings with NaN
-    in them never compare equal."""
+    """Points of all axes in one entity, or one entity an axis where rows differ in their axes: recordings with NaN
+    never compare equal."""
     there = np.isfinite(values)
     if there.all():
         _log_points(recorder, path, t_ns, values, marks)
@@ -192,7 +189,7 @@ def _log_axes(
         _log_points(recorder, f"{path}/{k}", t_ns[mask], values[mask, k : k + 1], marks.of(k))
 
 
-def _log_points(recorder: Recorder, path: str, t_ns: NDArray[np.int64], values: Floats, marks: Marks) -> None:
+def _log_points(recorder: Recorder, path: str, t_ns: Times, values: Floats, marks: Marks) -> None:
     import rerun as rr
 
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.rerun_log import colours
 from smartnav_graph.output.rerun_log.events import REJECTED, USED, WITHHELD, Events, stops
@@ -25,8 +24,8 @@ ELLIPSOID_SIGMAS = 3.0
 class Extent:
     """Box of the path in nav metres: `low`, `high` (3,), with some of its `points` (n, 3).
 
-    `shift` (3,) is taken off everything drawn. The viewer keeps positions as 32-bit floats: far from the origin
-    (projected coordinates of a session without origin) they would lose decimetres, so whole kilometres are taken off.
+    `shift` (3,) is subtracted from everything drawn. The viewer has 32-bit floats: far from the origin (projected
+    coordinates of a session without origin) they would lose decimetres, so whole kilometres are subtracted.
     """
 
     low: Floats
@@ -50,7 +49,7 @@ class Extent:
 
 
 def finite_rows(points: Floats) -> Floats:
-    """Rows without NaN: one such point blanks the whole 3D view."""
+    """Rows without NaN: one such point makes the whole 3D view empty."""
     return points[np.isfinite(points).all(axis=1)]
 
 
@@ -114,7 +113,7 @@ class Scene:
     session: Session
     extent: Extent
 
-    def local(self, enu: Floats) -> Any:
+    def local(self, enu: Floats) -> NDArray[np.float32]:
         """Nav metres as drawn, 32-bit."""
         return (enu - self.extent.shift).astype(np.float32)
 
@@ -151,10 +150,8 @@ class Scene:
             lat_lon = self.session.frame.lla_from_nav(enu[good])[:, :2]
             self.recorder.static(f"/geo/{path}", rr.GeoPoints(lat_lon=lat_lon, colors=colour, radii=radius))
 
-    def ellipsoids(
-        self, path: str, t_ns: NDArray[np.int64], enu: Floats, covariance: Floats, colour: list[int]
-    ) -> None:
-        """The ellipsoid of the moment, at true size, at /world/<path>."""
+    def ellipsoids(self, path: str, t_ns: Times, enu: Floats, covariance: Floats, colour: list[int]) -> None:
+        """The ellipsoid at the chosen time, at true size, at /world/<path>."""
         import rerun as rr
 
         good = _known(covariance) & np.isfinite(enu).all(axis=1)
@@ -167,14 +164,14 @@ class Scene:
         self.recorder.style(f"/world/{path}", style)
 
 
-def _known(covariance: Floats) -> NDArray[np.bool_]:
-    """Which covariances (n, 3, 3) have an ellipsoid."""
+def _known(covariance: Floats) -> Mask:
+    """Whether each covariance (n, 3, 3) has an ellipsoid."""
     finite = np.isfinite(covariance).all(axis=(1, 2))
     return np.asarray(finite & (np.trace(covariance, axis1=1, axis2=2) > 0))
 
 
 def log_solution(scene: Scene, solution: Solution) -> float:
-    """Path, moving body with axes and velocity, covariance ellipsoids; the magnification of those along the path."""
+    """Path, moving body with axes and velocity, ellipsoids; returns the magnification of those along the path."""
     scene.path("est", solution.nav_t_body, colours.ESTIMATE, 1.5)
     good = np.isfinite(solution.nav_t_body).all(axis=1) & np.isfinite(solution.nav_R_body).all(axis=(1, 2))
     rows = np.flatnonzero(good)
@@ -203,7 +200,7 @@ def _log_body(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> None:
 
 
 def _log_covariance(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> float:
-    """The current ellipsoid at true size, and an evenly taken set along the path, magnified by a round factor."""
+    """The ellipsoid at the chosen time, true size, and some along the path, magnified by a round factor."""
     import rerun as rr
 
     covariance = solution.covariance[rows][:, POS, POS]
@@ -230,7 +227,7 @@ def _log_covariance(scene: Scene, solution: Solution, rows: NDArray[np.intp]) ->
 
 
 def log_fixes(scene: Scene, events: Events) -> None:
-    """GNSS fixes by what became of them, the fix of the moment, and other positions."""
+    """GNSS fixes by their use, the latest fix, and other positions."""
     import rerun as rr
 
     session, recorder = scene.session, scene.recorder

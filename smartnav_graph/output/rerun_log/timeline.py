@@ -1,19 +1,17 @@
-"""States along time and the log: gaps, outages, standstills, rejections, warnings."""
+"""Status over time and the log: gaps, outages, standstills, rejections, warnings."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from smartnav_graph.core.timebase import Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.output.rerun_log.recorder import Recorder
+from smartnav_graph.output.summary_json import Summary, list_of, table_of, text_of
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
-MOST_LINES_A_KIND = 200
+MOST_OF_A_KIND = 200
 
 _LEGEND = {
     "/world/est/path": "**blue line**, the smoothed path",
@@ -21,35 +19,32 @@ _LEGEND = {
     "/world/est/velocity": "**light green arrow**, the path of one second at the velocity of the chosen time",
     "/world/est/covariance": "**orange, filled**, 3σ ellipsoid of the position at the chosen time, true size",
     "/world/est/covariances": "**orange, wire**, 3σ ellipsoids along the path, magnified as the view's name says",
-    "/world/causal/path": "**gold line**, the estimate when each keyframe became known",
-    "/world/causal/now": "**gold point**, the estimate that the chosen time had of itself",
+    "/world/causal/path": "**gold line**, the causal estimate: each keyframe when it became known",
+    "/world/causal/now": "**gold point**, the causal estimate at the chosen time",
     "/world/causal/covariance": "**gold, filled**, its 3σ ellipsoid, true size",
-    "/world/causal/window": "**magenta line**, the window: what the update of the chosen time could still correct, "
-    "as it left it",
+    "/world/causal/window": "**magenta line**, the window: the keyframes that the update at the chosen time corrects",
     "/world/reference/path": "**thin grey line**, the reference",
     "/world/gnss/fixes": "**green points**, GNSS fixes; large: the latest one",
-    "/world/gnss/withheld": "**violet points**, fixes that are not in the solution (withheld, or outside it)",
+    "/world/gnss/withheld": "**violet points**, fixes not in the solution (withheld, or outside its time span)",
     "/world/gnss/rejected": "**red points**, rejected fixes",
     "/world/rejected": "**red points**, rejected positions of other kinds",
-    "/world/pose_fixes": "**cyan points**, position fixes from elsewhere",
-    "/world/control": "**pink points**, surveyed points",
-    "/error/position": "**bands**, one and three sigma of the run. Where the run was aligned to the reference first, "
-    "errors are not nil at the start, while the sigmas may be",
+    "/world/pose_fixes": "**cyan points**, pose fixes",
+    "/world/control": "**pink points**, control points",
+    "/error/position": "**bands**, one and three sigma of the run. If the run was aligned to the reference, errors are "
+    "not zero at the start, but sigmas may be",
 }
 
 _IMAGE_LEGEND = {
-    "/matches": "**lines** from where a point was in the first image of a pair to where it is in the second, the last "
-    "one matched: **green**, in use; **red**, refused, alone or with its pair; **amber**, of a pair without a "
-    "baseline to speak of or with too few matches; **light blue**, not judged",
-    "/tracks": "**points**, tracked features, one colour a track",
+    "/matches": "**lines** from a point in the first image of a pair to the same in the second: **green**, in use; "
+    "**red**, rejected; **amber**, in a pair with insufficient baseline or too few matches; **light blue**, not tested",
+    "/tracks": "**points**, tracked features, one colour for each track",
 }
 
 Line = tuple[int, str, str]
 
 
 def log_status(recorder: Recorder, session: Session, events: Events) -> None:
-    """What was there when: /status/imu, /status/gnss, /status/motion, and /status/<sensor>_gate where rows of positions
-    were rejected."""
+    """/status/imu, /status/gnss, /status/motion, and /status/<sensor>_gate where rows of positions were rejected."""
     if session.imu is not None:
         _log_state(recorder, "/status/imu", events, events.gaps, "recorded")
     if session.gnss is not None:
@@ -63,7 +58,7 @@ def log_status(recorder: Recorder, session: Session, events: Events) -> None:
 
 
 def _rejections(stream: Stream, events: Events) -> list[Gap]:
-    """From each rejected row to the next."""
+    """From each rejected row to the next row."""
     t = np.concatenate([stream.t_ns, [max(events.end_ns, int(stream.t_ns[-1]))]])
     rejected = np.flatnonzero(events.use[stream.NAME] == REJECTED)
     return [Gap(int(t[i]), int(t[i + 1]), "rejected") for i in rejected]
@@ -73,19 +68,17 @@ def _log_state(recorder: Recorder, path: str, events: Events, spans: list[Gap], 
     recorder.states(path, *switches(events.start_ns, spans, between))
 
 
-def log_lines(
-    recorder: Recorder, session: Session, events: Events, summary: Mapping[str, Any], told: list[str]
-) -> None:
-    """The log at /log: what the session holds, initialisation, warnings, gaps, outages, rejected fixes."""
+def log_lines(recorder: Recorder, session: Session, events: Events, summary: Summary, notes: list[str]) -> None:
+    """The log at /log: streams of the session, initialisation, warnings, gaps, outages, rejected fixes."""
     import rerun as rr
 
-    lines = [*_opening(session, events, summary, told), *_happenings(session, events)]
+    lines = [*_first_lines(session, events, summary, notes), *_event_lines(session, events)]
     lines.sort(key=lambda line: line[0])
     columns = rr.TextLog.columns(text=[text for _, _, text in lines], level=[level for _, level, _ in lines])
     recorder.rows("/log", [t for t, _, _ in lines], columns)
 
 
-def _opening(session: Session, events: Events, summary: Mapping[str, Any], told: list[str]) -> list[Line]:
+def _first_lines(session: Session, events: Events, summary: Summary, notes: list[str]) -> list[Line]:
     start = events.start_ns
     lines = [
         (start, "INFO", f"{name}: {len(stream)} rows{_rate(stream)}") for name, stream in session.streams().items()
@@ -94,33 +87,22 @@ def _opening(session: Session, events: Events, summary: Mapping[str, Any], told:
         lines += [
             (start, "WARN", f"{stream}: {count} rows dropped or repaired ({why})") for why, count in counts.items()
         ]
-    begun = summary.get("initialisation")
-    if begun:
-        sentence = begun.get("sentence") if isinstance(begun, Mapping) else None
-        lines.append((start, "INFO", f"initialised: {sentence or flat(begun)}"))
-    lines += [(start, "WARN", str(text)) for text in summary.get("warnings", ())]
-    return lines + [(start, "INFO", text) for text in told]
+    sentence = text_of(table_of(summary, "initialisation"), "sentence")
+    lines += [(start, "INFO", f"initialisation: {sentence}")] if sentence else []
+    lines += [(start, "WARN", str(text)) for text in list_of(summary, "warnings")]
+    return lines + [(start, "INFO", text) for text in notes]
 
 
-def _rate(stream: Any) -> str:
+def _rate(stream: Stream) -> str:
     if len(stream) < 2:
         return ""
     step = float(np.median(np.diff(stream.t_ns))) / 1e9
     return f", {1 / step:.4g} Hz" if step > 0 else ""
 
 
-def flat(value: Any) -> str:
-    """A summary's value on one line."""
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {flat(item)}" for key, item in value.items())
-    if isinstance(value, list | tuple):
-        return " ".join(flat(item) for item in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _happenings(session: Session, events: Events) -> list[Line]:
+def _event_lines(session: Session, events: Events) -> list[Line]:
     kinds: list[list[Line]] = [
-        [(g.start_ns, "WARN", f"imu: {g.kind} for {g.length_s:.2f} s") for g in events.gaps],
+        [(g.start_ns, "WARN", f"IMU data gap: {g.kind} for {g.length_s:.2f} s") for g in events.gaps],
         [(g.start_ns, "WARN", f"gnss: no fix used for {g.length_s:.1f} s") for g in events.outages],
         [(g.start_ns, "INFO", f"standstill of {g.length_s:.1f} s") for g in events.standstills],
     ]
@@ -133,20 +115,20 @@ def _happenings(session: Session, events: Events) -> list[Line]:
 
 
 def _capped(lines: list[Line]) -> list[Line]:
-    """At most MOST_LINES_A_KIND of one kind; the last line tells how many more there are."""
-    if len(lines) <= MOST_LINES_A_KIND:
+    """At most MOST_OF_A_KIND of one kind; the last line says how many more there are."""
+    if len(lines) <= MOST_OF_A_KIND:
         return lines
-    t, level, text = lines[MOST_LINES_A_KIND]
-    return [*lines[:MOST_LINES_A_KIND], (t, level, f"{text}; {len(lines) - MOST_LINES_A_KIND - 1} more like this")]
+    t, level, text = lines[MOST_OF_A_KIND]
+    return [*lines[:MOST_OF_A_KIND], (t, level, f"{text}; {len(lines) - MOST_OF_A_KIND - 1} more like this")]
 
 
 def _of_images(path: str) -> str:
-    """What something drawn in an image means; empty for anything else."""
+    """The meaning of what is drawn in an image; empty for anything else."""
     return next((text for end, text in _IMAGE_LEGEND.items() if path.endswith(end) and path != "/pairs/matches"), "")
 
 
 def log_report(recorder: Recorder, markdown: str | None) -> None:
-    """The report's text at /report, and at /legend what the colours of the scene mean."""
+    """The report at /report, and the meaning of the colours at /legend."""
     import rerun as rr
 
     if markdown:
@@ -155,5 +137,5 @@ def log_report(recorder: Recorder, markdown: str | None) -> None:
     meaning |= {path: text for path in sorted(recorder.paths) if (text := _of_images(path))}
     lines = [f"* [{path}](recording:/{path}): {text}" for path, text in meaning.items()]
     if lines:
-        document = "# What is drawn\n\n" + "\n".join(lines) + "\n"
+        document = "# Legend\n\n" + "\n".join(lines) + "\n"
         recorder.static("/legend", rr.TextDocument(document, media_type="text/markdown"))

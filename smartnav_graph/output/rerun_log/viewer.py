@@ -45,7 +45,7 @@ def view(paths: Iterable[str | Path], web: bool = False) -> None:
 
     Parameters
     ----------
-    paths : .rrd files, run folders, session folders; several open beside each other
+    paths : .rrd files, run folders, session folders; several open together
     web : serve the viewer to a browser instead of opening a window
 
     Raises
@@ -78,7 +78,7 @@ def _require_display() -> None:
 
 
 def executable() -> Path:
-    """The viewer's binary: its Python wrapper would leave the window behind when it is interrupted."""
+    """The viewer's binary: its Python wrapper would leave the window open when it is interrupted."""
     package = importlib.util.find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise SmartnavError("Rerun viewer", "is not installed", "the package rerun-sdk", "pip install rerun-sdk")

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import html
+from smartnav_graph.output.report.text import Row, Table, count, distance, duration, number
 
 from smartnav_graph.output.report.svg import Plot, axis, exact_axis, log_axis, spread_axis, time_axis
-from smartnav_graph.output.report.text import Row, Table, count, distance, duration, number
 from smartnav_graph.output.report.thin import thin_band, thin_dots, thin_line, thin_path
 from smartnav_graph.output.report.track import _axes
 

@@ -1,4 +1,4 @@
-"""Numbers in words, and tables that render as HTML and as Markdown alike."""
+"""Numbers as text, and tables that render as HTML and as Markdown."""
 
 from __future__ import annotations
 
@@ -6,21 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any
+
+from smartnav_graph.output.summary_json import as_float
 
 THIN = "\u202f"
 DASH = "–"
-
-
-def as_float(value: Any) -> float | None:
-    """A finite float, or None for anything else (absent, null, NaN, text)."""
-    if isinstance(value, bool) or value is None:
-        return None
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return None
-    return number if math.isfinite(number) else None
 
 
 def fixed(value: float, decimals: int) -> str:
@@ -29,8 +19,8 @@ def fixed(value: float, decimals: int) -> str:
     return f"−{text}" if value < 0 and float(f"{value:.{decimals}f}") != 0 else text
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """`digits` significant figures, integer digits never rounded away; a dash for what is not known."""
+def number(value: object, digits: int = 3) -> str:
+    """`digits` significant figures, all integer digits kept; a dash for an unknown value."""
     v = as_float(value)
     if v is None:
         return DASH
@@ -43,7 +33,7 @@ def number(value: Any, digits: int = 3) -> str:
     return fixed(v, max(0, digits - 1 - exponent))
 
 
-def metres(value: Any) -> str:
+def metres(value: object) -> str:
     """A small length: to the millimetre below 1 m (to 0.1 mm below 1 cm), else three figures."""
     v = as_float(value)
     if v is None:
@@ -51,19 +41,19 @@ def metres(value: Any) -> str:
     return f"{fixed(v, 4 if abs(v) < 0.01 else 3) if abs(v) < 1 else number(v)} m"
 
 
-def count(value: Any) -> str:
+def count(value: object) -> str:
     """A whole number."""
     v = as_float(value)
     return DASH if v is None else fixed(round(v), 0)
 
 
-def seconds(value: Any, decimals: int = 1) -> str:
+def seconds(value: object, decimals: int = 1) -> str:
     v = as_float(value)
     return DASH if v is None else f"{fixed(v, decimals)} s"
 
 
-def duration(value: Any) -> str:
-    """Seconds in the units people say: 42.1 s, 7 min 49 s, 1 h 02 min."""
+def duration(value: object) -> str:
+    """Seconds, minutes and hours: 42.1 s, 7 min 49 s, 1 h 02 min."""
     v = as_float(value)
     if v is None:
         return DASH
@@ -75,7 +65,7 @@ def duration(value: Any) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-def distance(value: Any) -> str:
+def distance(value: object) -> str:
     """Metres below one kilometre, else kilometres."""
     v = as_float(value)
     if v is None:
@@ -83,7 +73,7 @@ def distance(value: Any) -> str:
     return f"{number(v / 1000)} km" if v >= 1000 else f"{number(v)} m"
 
 
-def plural(n: Any, one: str, many: str | None = None) -> str:
+def plural(n: object, one: str, many: str | None = None) -> str:
     """``1 fix``, ``3 fixes``."""
     return f"{count(n)} {one if as_float(n) == 1 else many or one + 's'}"
 
@@ -97,7 +87,7 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def attributes(data: Mapping[str, Any]) -> str:
+def attributes(data: Mapping[str, object]) -> str:
     """``data-`` attributes of the values that are known, numbers in full precision."""
     return "".join(f' data-{name}="{escape(str(value))}"' for name, value in data.items() if value is not None)
 
@@ -107,7 +97,7 @@ class Row:
     """Cells of plain text; `data` becomes ``data-`` attributes of the HTML row."""
 
     cells: Sequence[str]
-    data: Mapping[str, Any] = field(default_factory=dict)
+    data: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,21 @@
-"""What a run found once and for all (clock offsets, mounts, scales, noise) and how it began, in words and rows."""
+"""States of the session (clock offsets, mounts, scales, noise) and the initialisation: sentences and tables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from smartnav_graph.output.report.facts import Summary, room, sensor_name, things
-from smartnav_graph.output.report.text import DASH, Row, Table, as_float, capital, number, seconds
+from smartnav_graph.factors import title_of
+from smartnav_graph.output.summary_json import Summary, as_float, list_of, table_of, text_of
+from smartnav_graph.output.text import DASH, Row, Table, capital, number, seconds
 
 DEG = float(np.degrees(1.0))
 
 
 class Part(NamedTuple):
-    """One number of a state: what it is, the unit it is told in, and units told in one SI unit."""
+    """One number of a state: its name, the unit it is shown in, and the factor from SI to that unit."""
 
     label: str
     unit: str = ""
@@ -24,17 +25,17 @@ class Part(NamedTuple):
 BODY = ("x", "y", "z")
 PARTS: Mapping[str, Sequence[Part]] = {
     "vehicle_mount": (
-        Part("Vehicle's axes in the device, pitch", "°", DEG),
-        Part("Vehicle's axes in the device, yaw", "°", DEG),
+        Part("Vehicle mount, pitch", "°", DEG),
+        Part("Vehicle mount, yaw", "°", DEG),
         Part("Rear axle, forward of the IMU", "m"),
         Part("Rear axle, left of the IMU", "m"),
-        Part("Rear axle on the road, above the IMU", "m"),
-        Part("Lever arm of the pitching body", "m"),
-        Part("Slip of the tyres", "°/(m/s²)", DEG),
-        Part("Squat of the springs", "°/(m/s²)", DEG),
+        Part("Rear axle, above the IMU", "m"),
+        Part("Lever arm of the pitch motion", "m"),
+        Part("Tyre slip per acceleration", "°/(m/s²)", DEG),
+        Part("Suspension pitch per acceleration", "°/(m/s²)", DEG),
     ),
     "wheel_scale_and_delay_s": (Part("Wheel speed, scale", "%", 100.0), Part("Wheel speed, delay", "s")),
-    "step_factor": (Part("Step factor, ahead"), Part("Step factor, to the left")),
+    "step_factor": (Part("Step factor, forward"), Part("Step factor, left")),
     "imu_scale_misalignment": tuple(
         Part(f"{sensor}, {'scale' if i == j else 'misalignment'} {i}{'' if i == j else j}", "%", 100.0)
         for sensor in ("Accelerometer", "Gyroscope")
@@ -45,8 +46,8 @@ PARTS: Mapping[str, Sequence[Part]] = {
     "gyro_noise_density": (Part("Gyroscope noise density", "°/s/√Hz", DEG),),
     "accel_bias_walk": (Part("Accelerometer bias walk", "m/s²/√s"),),
     "gyro_bias_walk": (Part("Gyroscope bias walk", "°/s/√s", DEG),),
-    "vehicle_lateral_sigma": (Part("Sideways speed of a vehicle, 1 sigma", "m/s"),),
-    "vehicle_vertical_sigma": (Part("Vertical speed of a vehicle, 1 sigma", "m/s"),),
+    "vehicle_lateral_sigma": (Part("Lateral velocity of the vehicle, 1 sigma", "m/s"),),
+    "vehicle_vertical_sigma": (Part("Vertical velocity of the vehicle, 1 sigma", "m/s"),),
     "wheel_sigma": (Part("Wheel speed, 1 sigma", "m/s"),),
 }
 UNITS = (
@@ -73,12 +74,12 @@ def parts_of(name: str, size: int) -> list[Part]:
         ((name.removesuffix(suffix), unit, factor) for suffix, unit, factor in UNITS if name.endswith(suffix)),
         (name, "", 1.0),
     )
-    label = named(stem)
+    name_of_all = named(stem)
     if size == 1:
-        return [Part(label, unit, factor)]
+        return [Part(name_of_all, unit, factor)]
     axes = ("east", "north", "up") if name.endswith(NOISE) else BODY
     letters = axes if size == 3 else [str(i + 1) for i in range(size)]
-    return [Part(f"{label}, {letter}", unit, factor) for letter in letters]
+    return [Part(f"{name_of_all}, {letter}", unit, factor) for letter in letters]
 
 
 def named(name: str) -> str:
@@ -88,11 +89,11 @@ def named(name: str) -> str:
     return " ".join("1 sigma" if word == "sigma" else word for word in words)
 
 
-def constants(summary: Summary) -> list[tuple[str, Table]]:
-    """Titled tables: clocks, mounts and scales, noise; only those that a run has."""
+def tables(summary: Summary) -> list[tuple[str, Table]]:
+    """Tables with titles: clock offsets, mounts and scales, noise; without the empty ones."""
     groups: dict[str, list[Row]] = {"Clock offsets": [], "Mounts and scales": [], "Noise": []}
-    for name, state in room(summary, "states").items():
-        if isinstance(state, Mapping):
+    for name, state in _states(summary):
+        if state:
             kind = "Clock offsets" if name.endswith(CLOCK) else "Noise" if name.endswith(NOISE) else "Mounts and scales"
             groups[kind] += _rows(name, state)
     return [
@@ -100,68 +101,61 @@ def constants(summary: Summary) -> list[tuple[str, Table]]:
     ]
 
 
-def _rows(name: str, state: Mapping[str, Any]) -> list[Row]:
-    values, sigmas, seen = (_listed(state.get(key)) for key in ("value", "sigma", "observed"))
-    held, rows = bool(state.get("held")), []
+def _states(summary: Summary) -> list[tuple[str, Summary]]:
+    states = table_of(summary, "states")
+    return [(name, table_of(states, name)) for name in states]
+
+
+def _rows(name: str, state: Summary) -> list[Row]:
+    values, sigmas, observed = (list_of(state, key) for key in ("value", "sigma", "observed"))
+    fixed, rows = bool(state.get("held")), []
     for i, part in enumerate(parts_of(name, len(values))):
         value, sigma = as_float(values[i]), as_float(sigmas[i]) if i < len(sigmas) else None
-        unseen = i < len(seen) and seen[i] is False
-        how = "as given" if held else "rests on its prior" if unseen else "estimated"
-        shown = DASH if held or sigma is None else number(sigma * part.factor)
-        label = f"{part.label} [{part.unit}]" if part.unit else part.label
-        data = {"state": name, "value": value, "sigma": sigma, "held": str(held).lower()}
-        rows.append(Row([label, number(None if value is None else value * part.factor), shown, how], data))
+        unobservable = i < len(observed) and observed[i] is False
+        how = "fixed" if fixed else "not observable (prior only)" if unobservable else "estimated"
+        shown = DASH if fixed or sigma is None else number(sigma * part.factor)
+        title = f"{part.label} [{part.unit}]" if part.unit else part.label
+        data = {"state": name, "value": value, "sigma": sigma, "fixed": str(fixed).lower()}
+        rows.append(Row([title, number(None if value is None else value * part.factor), shown, how], data))
     return rows
 
 
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else [] if value is None else [value]
-
-
 def clock_sentences(summary: Summary) -> list[str]:
-    """What each estimated clock offset means."""
-    told = []
-    for name, state in room(summary, "states").items():
-        if not (name.endswith(CLOCK) and isinstance(state, Mapping)) or state.get("held"):
+    """The meaning of each estimated clock offset."""
+    sentences = []
+    for name, state in _states(summary):
+        value, sigma = ([as_float(x) for x in list_of(state, key)] for key in ("value", "sigma"))
+        if not name.endswith(CLOCK) or state.get("held") or not value or value[0] is None:
             continue
-        value, sigma = (_listed(state.get(key)) for key in ("value", "sigma"))
-        offset = as_float(value[0]) if value else None
-        if offset is None:
-            continue
-        sensor = name.removesuffix(CLOCK)
-        thing = things(sensor, 1).split(maxsplit=1)[-1]
-        sure = f" (1 sigma {_milli(sigma[0])})" if sigma and as_float(sigma[0]) is not None else ""
-        side = "later" if offset >= 0 else "earlier"
-        article = "an" if thing[0] in "aeiou" else "a"
-        told.append(
-            f"{sensor_name(sensor)}: {article} {thing} was taken {_milli(abs(offset))} {side} than its stamp{sure}."
-        )
-    return told
+        spread = f" (1 sigma {_milli(sigma[0])})" if sigma and sigma[0] is not None else ""
+        side = "later" if value[0] >= 0 else "earlier"
+        sensor = title_of(name.removesuffix(CLOCK))
+        sentences.append(f"{sensor}: measured {_milli(abs(value[0]))} {side} than the time stamp{spread}.")
+    return sentences
 
 
-def _milli(value: Any) -> str:
-    v = as_float(value)
-    return DASH if v is None else f"{number(1000 * v, 2)} ms" if abs(v) < 1 else seconds(v, 2)
+def _milli(value: float) -> str:
+    return f"{number(1000 * value, 2)} ms" if abs(value) < 1 else seconds(value, 2)
 
 
 START = {
     "method": "Method",
     "heading_deg": "Heading [°]",
     "sigma_heading_deg": "1 sigma of the heading [°]",
-    "stretch_s": "Data it rests on [s]",
-    "starts": "Starts that were tried",
+    "stretch_s": "Data used [s]",
+    "starts": "Initial guesses tried",
 }
 
 
 def initialisation(summary: Summary) -> tuple[str, Table]:
-    """How the start was found, in a sentence, and what else is known of it."""
+    """The initialisation: a sentence, and a table of the rest."""
     start = summary.get("initialisation")
     if isinstance(start, str):
         return plain_units(capital(start)), Table(("", ""), [])
-    table = room(summary, "initialisation")
-    sentence = plain_units(capital(str(table.get("sentence") or "")))
+    table = table_of(summary, "initialisation")
+    sentence = plain_units(capital(text_of(table, "sentence")))
     rest = {k: v for k, v in table.items() if k != "sentence" and not isinstance(v, Mapping)}
-    return sentence, Table(("", ""), [Row([START.get(k, named(k)), _told(v)]) for k, v in rest.items()])
+    return sentence, Table(("", ""), [Row([START.get(k, named(k)), _shown(v)]) for k, v in rest.items()])
 
 
 def plain_units(text: str) -> str:
@@ -169,7 +163,7 @@ def plain_units(text: str) -> str:
     return text.replace(" deg", "°").replace("+-", "±").replace("±°", "± °")
 
 
-def _told(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(number(v) for v in value)
     if isinstance(value, int):
