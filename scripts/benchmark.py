@@ -196,7 +196,7 @@ def measure_recording(path: Path, *, with_pictures: bool) -> None:
         session = pictured(session, path.parent / "jpeg", count=2000)
     with tempfile.TemporaryDirectory() as folder:
         file, begin, cpu = Path(folder) / "run.rrd", time.perf_counter(), time.process_time()
-        write_recording(file, session=session, solution=run.solution, summary=run.summary, trace=run.trace)
+        write_recording(file, session=session, solution=run.solution, summary=run.summary, diagnostics=run.trace)
         cpu = time.process_time() - cpu
         detail = {"wall_s": round(time.perf_counter() - begin, 4), "size_mb": round(file.stat().st_size / 1e6, 2)}
     detail |= {"samples": len(session.require_imu()), "keyframes": len(run.solution)}
@@ -245,7 +245,7 @@ def make_run(session: str, folder: Path) -> str:
     """A run on disk, without report and recording."""
     path = folder / "run"
     code = (
-        "import sys, smartnav_graph as sn; from smartnav_graph import run_folder\n"
+        "import sys, smartnav_graph as sn; from smartnav_graph.output import run_folder\n"
         "run_folder.write_run(sn.run(sn.load(sys.argv[1])), sys.argv[2], report=False, recording=False)"
     )
     subprocess.run([sys.executable, "-c", code, session, str(path)], check=True)

@@ -103,7 +103,7 @@ EVALUATION = SimpleNamespace(
 SUMMARY = {
     "gaps": [{"start_s": 24.98, "length_s": 1.52, "kind": "missing"}],
     "warnings": ["gnss: sigmas missing"],
-    "initialisation": {"mode": "dynamic", "heading_deg": 12.5},
+    "initialisation": {"sentence": "started while moving", "heading_deg": 12.5},
 }
 
 

@@ -11,6 +11,9 @@ import numpy as np
 
 Summary = Mapping[str, object]
 
+# Kinds of IMU data gaps, as shown.
+GAP_KINDS = {"bridged": "linearly interpolated", "missing": "no samples"}
+
 
 class ImuGap(NamedTuple):
     """One IMU data gap: start and length in s; kind ``bridged`` (linearly interpolated) or ``missing`` (no samples)."""

@@ -84,7 +84,7 @@ def test_an_interrupted_replay_leaves_a_valid_partial_run(call, workshop, tmp_pa
         f"replay eight --out {tmp_path}/part --lag 5 --replay.polish false --to 20 --initial 0,0,0,0,3,30"
     )
     assert code == 0
-    assert "interrupted; what was done until then is written" in err and "interrupted" in out
+    assert "interrupted; the part that was done is written" in err and "interrupted" in out
     stored = read_run(tmp_path / "part")
     assert len(stored.solution) == len(stored.causal) == 9
     whole = read_run(workshop / "replay")
@@ -175,11 +175,11 @@ def test_compare_tells_how_far_two_runs_are_apart(call, tmp_path):
 def test_explain_tells_what_determined_a_state(call):
     code, out, err = call("explain run --at 10")
     assert (code, err) == (0, "")
-    assert "What is uncertain about the position comes from" in out and "pull in sigmas" in out
+    assert "Horizontal position variance by source" in out and "shift in sigmas" in out
     told = json.loads(call("explain run --json")[1])
     assert told["asked_s"] is None and told["keyframe"]["of"] == 22
     code, _, err = call("explain run --at 99")
-    assert code == 1 and "--at: 99 s; expected 0.000 to 20.000 s, where the run is" in err
+    assert code == 1 and "--at: 99 s; expected 0.000 to 20.000 s, the time span of the run" in err
 
 
 def test_info_of_a_degraded_session(call, tmp_path):
@@ -225,7 +225,7 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     code, _, err = call(f"demo --out {tmp_path}/mine")
-    assert code == 1 and "exists already and is no demo" in err
+    assert code == 1 and "exists already and is not of the demo" in err
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["letter.txt"]
     demo.claim(tmp_path / "demo")
     demo.claim(tmp_path / "demo")  # its own it may take again
@@ -267,7 +267,7 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
         ("export run --format tum --out eight --force", "eight: is a folder; expected the name of a file"),
         ("export run --format tum --out eight/session.toml", "eight/session.toml: exists already"),
         ("export run --format images --out new", "eight: has no images"),
-        ("export run --format images --out new --session gone", "run: came from gone, which is not there"),
+        ("export run --format images --out new --session gone", "run: was computed from gone, which does not exist"),
         ("view nowhere --web", "nowhere: does not exist"),
     ],
 )

@@ -21,10 +21,10 @@ def runs(tmp_path_factory):
     return read_run(folder / "all"), read_run(folder / "half")
 
 
-def test_text_says_where_how_far_and_what_was_asked(runs):
+def test_text_has_differences_and_options(runs):
     found = compare_runs(*runs)
     text = found.to_text()
-    assert text.startswith(f"{runs[1].path} less {runs[0].path} at {len(found.states)} common epochs (of ")
+    assert text.startswith(f"{runs[1].path} minus {runs[0].path} at {len(found.states)} common epochs (of ")
     assert "config   run.withhold: [] | [gnss:every=2]" in text
     assert "figures  withheld.gnss: - | " in text
     (line,) = [line for line in text.splitlines() if line.startswith("horizontal m")]
@@ -47,7 +47,7 @@ def test_rejected_rows_of_one_run_are_named(runs):
     assert "rejected gnss: in both 0, only in first: 0, only in second: 2 (rows 4, 7)" in text
 
 
-def test_few_common_epochs_are_told_with_a_remedy(runs):
+def test_few_common_epochs_are_reported_with_a_remedy(runs):
     one, other = runs
     every = np.arange(0, len(other.solution), 5)
     names = ("t_ns", "nav_R_body", "nav_t_body", "nav_v_body", "accel_bias", "gyro_bias", "covariance")
@@ -55,7 +55,7 @@ def test_few_common_epochs_are_told_with_a_remedy(runs):
     moved = columns["t_ns"] + 1  # another clock's rounding: no stamp in common but every fifth
     moved[every] -= 1
     text = compare_runs(one, replace(other, solution=replace(other.solution, **(columns | {"t_ns": moved})))).to_text()
-    assert "the same --rate HZ gives both more of them" in text.splitlines()[0]
+    assert "use the same --rate HZ for both to get more" in text.splitlines()[0]
 
 
 def test_the_document_has_a_table_for_each_kind(runs):

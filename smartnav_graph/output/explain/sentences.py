@@ -23,6 +23,7 @@ from smartnav_graph.output.explain.figures import (
     shifts,
 )
 from smartnav_graph.output.explain.nearby import Nearby, Span
+from smartnav_graph.output.summary_json import GAP_KINDS
 from smartnav_graph.output.text import listed
 
 # A smaller share of a variance is left out of the sentences.
@@ -190,7 +191,7 @@ def _surroundings(near: Nearby) -> Iterator[str]:
     if near.gap is None:
         yield "No IMU data gaps."
     else:
-        yield _span("IMU data gap", near.gap, "linearly interpolated" if near.gap.kind == "bridged" else "no samples")
+        yield _span("IMU data gap", near.gap, GAP_KINDS.get(near.gap.kind, near.gap.kind))
     if near.rejection is None:
         yield "No measurement was rejected."
     else:

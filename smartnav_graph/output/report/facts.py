@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from smartnav_graph.factors import title_of
 from smartnav_graph.output.summary_json import (
+    GAP_KINDS,
     ImuGap,
     Summary,
     as_float,
@@ -31,7 +32,6 @@ from smartnav_graph.output.text import (
 )
 
 MOST_REJECTED = 0.25  # share of a sensor's measurements that may be outliers
-GAP_KINDS = {"bridged": "linearly interpolated", "missing": "no samples"}
 MODES = {
     "batch": "smoothed in one batch",
     "replay": "replayed one window at a time",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from smartnav_graph.factors import label_of
 from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
+from smartnav_graph.output.summary_json import GAP_KINDS
 
 AXES = [[235, 80, 80], [90, 200, 100], [90, 150, 255]]
 ESTIMATE = [90, 160, 255]
@@ -38,8 +39,8 @@ GOOD, POOR, BAD, STANDSTILL = [60, 140, 80], [200, 130, 40], [210, 60, 60], [70,
 _STATUS = {
     **dict.fromkeys(REASONS, POOR),
     **dict.fromkeys(("recorded", "fix", "moving", "accepted", REASONS[IN_USE]), GOOD),
-    **dict.fromkeys(("missing", "outage", "rejected", REASONS[CONTRARY]), BAD),
-    "interpolated": POOR,
+    **dict.fromkeys((GAP_KINDS["missing"], "outage", "rejected", REASONS[CONTRARY]), BAD),
+    GAP_KINDS["bridged"]: POOR,
     "standstill": STANDSTILL,
 }
 

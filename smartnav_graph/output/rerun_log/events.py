@@ -12,12 +12,11 @@ from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.timebase import NS, Gap, find_gaps, nearest, ns_from_seconds
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.output import summary_json
-from smartnav_graph.output.summary_json import Summary, standstill_spans
+from smartnav_graph.output.summary_json import GAP_KINDS, Summary, standstill_spans
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
 USED, REJECTED, WITHHELD = 0, 1, 2
-GAP_KINDS = {"bridged": "interpolated"}  # others as they are
 
 
 @dataclass(frozen=True)

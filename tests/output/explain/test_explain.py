@@ -1,4 +1,4 @@
-"""What determined a state, told of a run: the right instant, the right words, and errors that help."""
+"""What determines a state of a run: the right epoch, the right sentences, and errors with a remedy."""
 
 import json
 import re
@@ -29,24 +29,24 @@ def stored(folder):
     return read_run(folder)
 
 
-def told(found, start: str) -> str:
+def sentence_of(found, start: str) -> str:
     """The one sentence that begins so."""
     (sentence,) = [sentence for sentence in found.sentences if sentence.startswith(start)]
     return sentence
 
 
-def test_without_an_instant_the_least_certain_one_is_told(stored):
+def test_without_a_time_the_least_certain_epoch_is_explained(stored):
     found = explain(stored)
     horizontal = np.hypot(*stored.solution.sigmas[:, 3:5].T)
     t_s = stored.solution.seconds[horizontal.argmax()]
-    assert told(found, "The least certain").startswith(f"The least certain instant of the run is {t_s:.2f} s")
-    assert f"known to {horizontal.max():.3f} m (1 sigma" in told(found, "The position")
+    assert sentence_of(found, "Largest position").startswith(f"Largest position uncertainty of the run: at {t_s:.2f} s")
+    assert f"position {horizontal.max():.3f} m horizontal" in sentence_of(found, "1 sigma")
 
 
-def test_an_instant_is_told_by_the_nearest_keyframe(stored):
+def test_a_time_is_explained_by_the_nearest_keyframe(stored):
     at = float(stored.solution.seconds[10])
-    assert told(explain(stored, at), "At ").startswith(f"At {at:.2f} s (keyframe 11 of {len(stored.solution)}")
-    assert f"told by the nearest keyframe, at {at:.2f} s" in explain(stored, at + 0.1).sentences[0]
+    assert sentence_of(explain(stored, at), "At ").startswith(f"At {at:.2f} s (keyframe 11 of {len(stored.solution)}")
+    assert f"the keyframe nearest to {at + 0.1:.2f} s" in explain(stored, at + 0.1).sentences[0]
 
 
 def test_figures_add_up(stored):
@@ -55,20 +55,20 @@ def test_figures_add_up(stored):
         assert sum(component["share"].values()) == pytest.approx(1.0), component["name"]
     assert figures["balanced"]
     for side in ("east", "north", "up", "heading_clockwise"):
-        assert sum(pull[side] for pull in figures["pull_sigmas"].values()) == pytest.approx(0.0, abs=0.01)
+        assert sum(shift[side] for shift in figures["shift_sigmas"].values()) == pytest.approx(0.0, abs=0.01)
     assert json.loads(json.dumps(plain(figures), allow_nan=False))["sentences"]
 
 
-def test_positions_rest_on_the_only_fixes(stored):
+def test_positions_depend_on_the_only_fixes(stored):
     found = explain(stored, 10.0)
-    assert re.search(r"the position\b.* would be lost", told(found, "Without the GNSS fixes"))
+    assert re.search(r"position\b.* not observable", sentence_of(found, "Without the source GNSS"))
     east = found.to_dict()["components"][0]
-    assert east["name"] == "east" and "gnss" in east["rests_on"] and east["sigma_factor_without"]["gnss"] is None
-    assert not [sentence for sentence in found.sentences if sentence.startswith("Without the calibration")]
+    assert east["name"] == "east" and "gnss" in east["depends_on"] and east["sigma_factor_without"]["gnss"] is None
+    assert not [sentence for sentence in found.sentences if sentence.startswith("Without the source Calibration")]
 
 
-def test_a_fix_alone_beside_what_was_assumed(stored, tmp_path):
-    """One fix of 3 m and else assumptions: all of the place is its, all of the heading the first state's."""
+def test_a_single_fix_with_priors(stored, tmp_path):
+    """One fix of 3 m and priors: the fix has all of the position, the prior all of the heading."""
     x, v, b = (np.array([[key(letter, 0)]], dtype=np.uint64) for letter in "XVB")
     t_ns, row = stored.solution.t_ns[:1], np.array([0])
 
@@ -79,13 +79,11 @@ def test_a_fix_alone_beside_what_was_assumed(stored, tmp_path):
     frames = Keyframes(np.array([0]), t_ns, np.array(["first"], dtype=object), np.eye(3)[None])
     Influence([*known, group("gnss", x, np.eye(6)[3:] / 3.0)], frames).write(tmp_path)
     found = explain(replace(stored, path=tmp_path), float(stored.solution.seconds[0]))
-    assert told(found, "What is uncertain about the position").endswith("comes from the GNSS fixes (100%).")
-    assert "heading comes from the prior on the initial state (100%)" in " ".join(found.sentences)
-    assert "the heading, the tilt and the velocity would be lost" in told(found, "Without the first state")
-    assert "known to 4.243 m" in told(found, "The position")  # 3 m on each of two axes
-    assert told(found, "Measured at this very instant").startswith(
-        "Measured at this very instant: east 100%, north 100%"
-    )
+    assert sentence_of(found, "Horizontal position").endswith("variance by source: GNSS 100 %.")
+    assert "Heading variance by source: Initial state 100 %" in " ".join(found.sentences)
+    assert "heading, tilt and velocity not observable" in sentence_of(found, "Without the source Initial state")
+    assert "position 4.243 m horizontal" in sentence_of(found, "1 sigma")  # 3 m on each of two axes
+    assert "measurements at this epoch: east 100 %, north 100 %" in sentence_of(found, "Share")
     assert "keyframe 1 of 1, the first" in found.sentences[0]
 
 
@@ -103,7 +101,7 @@ def test_what_is_near():
     found = nearby(run, rows, 5.0)
     assert (found.gap.start_s, found.gap.away_s, found.gap.length_s) == (1.0, -2.0, 2.0)
     assert (found.standstill.start_s, found.standstill.away_s) == (0.0, -1.0)
-    assert (found.rejection["sensor"], found.rejection["away_s"]) == ("gnss", -2.0)
+    assert (found.rejection.sensor, found.rejection.away_s) == ("gnss", -2.0)
     assert set(found.used) == {"gnss"}
     assert (found.used["gnss"].before_s, found.used["gnss"].after_s) == (1.0, 2.5)
     assert nearby(run, rows, 2.0).gap.away_s == 0.0
@@ -112,8 +110,8 @@ def test_what_is_near():
 
 
 @pytest.mark.parametrize("at", [-0.5, 20.5, float("nan")])
-def test_an_instant_outside_the_run_is_refused(stored, at):
-    with pytest.raises(ConfigError, match=r"--at: .* s; expected 0\.\d* to \d+\.\d* s, where the run is"):
+def test_a_time_outside_the_run_is_refused(stored, at):
+    with pytest.raises(ConfigError, match=r"--at: .* s; expected 0\.\d* to \d+\.\d* s, the time span of the run"):
         explain(stored, at)
 
 
@@ -121,7 +119,7 @@ def test_an_instant_outside_the_run_is_refused(stored, at):
 def test_a_run_without_its_system_is_refused(stored, tmp_path, missing):
     for name in {"influence.parquet", "keyframes.parquet"} - {missing}:
         (tmp_path / name).write_bytes((stored.path / name).read_bytes())
-    with pytest.raises(SessionError, match=f"holds no {missing}; expected a run that can be explained; smooth the"):
+    with pytest.raises(SessionError, match=f"holds no {missing}; expected a run with its linear system; smooth the"):
         explain(replace(stored, path=tmp_path), 10.0)
 
 

@@ -1,4 +1,4 @@
-"""A made-up car drive with everything a report can show: holes, rejected and withheld fixes, an outage."""
+"""A made-up car drive with everything a report can show: data gaps, rejected and withheld fixes, an outage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from smartnav_graph.session.session import Device, Session
 from smartnav_graph.session.streams import GnssFix, Imu
 
 T0 = 46_534_478_375_790
-HOLES = [(36.4, 1.59, "bridged"), (198.7, 1.62, "bridged"), (219.7, 1.5, "bridged"), (307.8, 2.41, "missing")]
+GAPS = [(36.4, 1.59, "bridged"), (198.7, 1.62, "bridged"), (219.7, 1.5, "bridged"), (307.8, 2.41, "missing")]
 REJECTED = (50, 51, 52, 301)
 
 
@@ -38,6 +38,7 @@ class Compared:
     error_enu_m: Any
     rotation_error_deg: Any
     sigma_enu: Any
+    notes: Any = ()
 
     def to_dict(self) -> dict[str, Any]:
         e = np.linalg.norm(self.error_enu_m, axis=1)
@@ -147,8 +148,8 @@ def _session(solution: Solution, rng: np.random.Generator) -> Session:
 def _causal(solution: Solution, rng: np.random.Generator) -> Solution:
     from dataclasses import replace
 
-    wander = np.cumsum(rng.normal(size=(len(solution), 3)), axis=0) * 0.25
-    return replace(solution, nav_t_body=solution.nav_t_body + wander, covariance=solution.covariance * 6.0)
+    drift = np.cumsum(rng.normal(size=(len(solution), 3)), axis=0) * 0.25
+    return replace(solution, nav_t_body=solution.nav_t_body + drift, covariance=solution.covariance * 6.0)
 
 
 def _withheld(solution: Solution, rng: np.random.Generator) -> dict[str, Any]:
@@ -165,7 +166,7 @@ def _compared(solution: Solution, rng: np.random.Generator) -> Compared:
 
 def _updates(solution: Solution, rng: np.random.Generator) -> Updates:
     n = len(solution)
-    learned = np.stack([0.06 + 0.1 * np.exp(-np.arange(n) / 9), 0.003 + 0.2 * np.exp(-np.arange(n) / 9)], axis=1)
+    estimated = np.stack([0.06 + 0.1 * np.exp(-np.arange(n) / 9), 0.003 + 0.2 * np.exp(-np.arange(n) / 9)], axis=1)
     return Updates(
         t_ns=solution.t_ns,
         solved=np.full(n, 30),
@@ -176,7 +177,7 @@ def _updates(solution: Solution, rng: np.random.Generator) -> Updates:
         edge=np.zeros(n + 1, dtype=np.int64),
         past_ns=solution.t_ns[:0],
         past=np.zeros((0, 3)),
-        states={"gnss_time_offset_s": learned, "vehicle_mount.0": learned},
+        states={"gnss_time_offset_s": estimated, "vehicle_mount.0": estimated},
     )
 
 
@@ -189,7 +190,7 @@ def summary(n: int = 470) -> dict[str, Any]:
         "factors": {"imu": n - 1, "gnss": 231, "prior": 1, "vehicle": 460, "image_pairs": 60},
         "used": {"gnss": 231},
         "standstills": {"count": 2, "total_s": 21.5, "at_rest_s": 14.0, "spans_s": [[148.0, 158.5], [300.0, 311.0]]},
-        "image_pairs": {"in use": 60, "no baseline to speak of": 39, "contradicts the turn or the way": 1},
+        "image_pairs": {"in use": 60, "insufficient baseline": 39, "inconsistent with the other sensors": 1},
         "chi2_per_dof": {"overall": 1.04, "imu": 0.97, "gnss": 1.11},
         "iterations": 7,
         "converged": True,
@@ -217,7 +218,7 @@ def summary(n: int = 470) -> dict[str, Any]:
         "real_time_factor": 381.0,
         "update_ms": {"median": 0.31, "p99": 0.64, "max": 2.2},
         "peak_memory_mb": 214.3,
-        "gaps": [{"start_s": s, "length_s": length, "kind": kind} for s, length, kind in HOLES],
+        "gaps": [{"start_s": s, "length_s": length, "kind": kind} for s, length, kind in GAPS],
         "dropped": {"gnss": {"fixes outside the IMU's time span": 2}, "imu": {"repeated stamps dropped": 17}},
         "rejected": {"gnss": len(REJECTED)},
         "withheld": {"gnss": {"count": 235, "rms_horizontal_m": 0.284, "rms_3d_m": 0.41, "max_m": 1.32}},
@@ -227,7 +228,7 @@ def summary(n: int = 470) -> dict[str, Any]:
             "sigma_heading_deg": 1.8,
         },
         "warnings": [
-            "imu: 4 holes, 7.1 s in all; the uncertainty is raised inside; record without interruption if you can",
+            "imu: 4 data gaps, 7.1 s in all; the uncertainty is raised inside; record without interruption if you can",
             "gnss: sigma <b>missing</b> & assumed 3 m",
         ],
         "versions": {"smartnav-graph": "0.1.0", "gtsam": "4.3.0", "numpy": "2.4.1", "python": "3.11.7"},

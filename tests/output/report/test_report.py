@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_case import HOLES, REJECTED, Scored, drive, summary
+from drive_case import GAPS, REJECTED, Scored, drive, summary
 from lxml import html
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.graph.solution import Residuals, Solution
-from smartnav_graph.output.report import facts, report_markdown, write_report
+from smartnav_graph.output.report import facts, reference, report_markdown, write_report
 from smartnav_graph.output.report.statistics import accelerations
 from smartnav_graph.output.report.timeline import lanes
 from smartnav_graph.session.session import Session
@@ -44,8 +44,8 @@ def section(dom, name: str):
 def test_headline_says_what_happened(dom) -> None:
     text = words(section(dom, "headline"))
     assert "The recording of 7 min 49 s over 4.32 km was smoothed in one batch at 470 epochs." in text
-    assert "4 GNSS fixes were rejected as outliers; the IMU record has 4 holes, 7.1 s in all." in text
-    assert "235 GNSS fixes were withheld from the estimate; the result meets them within 0.284 m" in text
+    assert "Rejected as outliers: GNSS 4. IMU data gaps: 4, 7.1 s in all." in text
+    assert "Withheld GNSS: 235 measurements, RMS difference 0.284 m (horizontal)." in text
 
 
 def test_position_sigma_at_300_s_is_that_of_the_covariance(dom, case) -> None:
@@ -54,26 +54,26 @@ def test_position_sigma_at_300_s_is_that_of_the_covariance(dom, case) -> None:
     assert float(node.get("data-t-s")) == 300.0
     assert float(node.get("data-sigma-e-m")) == pytest.approx(e, rel=1e-9)
     assert float(node.get("data-sigma-horizontal-m")) == pytest.approx(np.hypot(e, n), rel=1e-9)
-    assert f"At t = 300 s the position is known to {np.hypot(e, n):.3f} m (1 sigma, horizontal)" in words(node)
+    assert f"Position, 1 sigma at t = 300 s: {np.hypot(e, n):.3f} m horizontal" in words(node)
 
 
-def test_short_run_tells_its_middle(tmp_path) -> None:
+def test_sigma_of_a_short_run_is_at_its_middle(tmp_path) -> None:
     case = drive(61)
     node = section(written(tmp_path, case), "sigma-at")
     assert float(node.get("data-t-s")) == 30.0
-    assert words(node).startswith("At t = 30 s the position is known to")
+    assert words(node).startswith("Position, 1 sigma at t = 30 s:")
 
 
-def test_imu_holes(dom) -> None:
-    node = section(dom, "imu-holes")
+def test_imu_data_gaps(dom) -> None:
+    node = section(dom, "imu-gaps")
     found = [
         (float(h.get("data-start-s")), float(h.get("data-length-s")), h.get("data-kind"))
-        for h in node.find_class("hole")
+        for h in node.find_class("imu-gap")
     ]
     assert node.get("data-count") == "4"
-    assert found == HOLES
-    assert "IMU hole at 36.4 s, 1.59 s, bridged by interpolation" in words(node)
-    assert "IMU hole at 307.8 s, 2.41 s, no samples" in words(node)
+    assert found == GAPS
+    assert "IMU data gap at 36.4 s, 1.59 s, linearly interpolated" in words(node)
+    assert "IMU data gap at 307.8 s, 2.41 s, no samples" in words(node)
 
 
 def test_used_rejected_dropped_withheld(dom) -> None:
@@ -87,7 +87,7 @@ def test_used_rejected_dropped_withheld(dom) -> None:
 def test_withheld_errors_are_shown_one_by_one(dom, case) -> None:
     horizontal = np.linalg.norm(case.withheld["gnss"].error[:, :2], axis=1)
     assert f"95 %: {np.percentile(horizontal, 95):.3f} m" in words(section(dom, "withheld"))
-    (dots,) = section(dom, "withheld").xpath('.//svg[@class="box"]/path[contains(@class, "held")]/@d')
+    (dots,) = section(dom, "withheld").xpath('.//svg[@class="box"]/path[contains(@class, "withheld")]/@d')
     assert dots.count("M") == len(horizontal)
 
 
@@ -110,7 +110,7 @@ def test_percentiles_lie_on_the_curve(tmp_path, case) -> None:
     score = {"control": {"count": 5, "rms_horizontal_m": 3.317}}
     dom = written(tmp_path, case, summary=summary() | {"withheld": score}, withheld=few)
     text = words(section(dom, "withheld"))
-    assert "50 %: 3.00 m" in text and "5 withheld control points." in text
+    assert "50 %: 3.00 m" in text and "5 withheld measurements (Control points)." in text
     (plot,) = section(dom, "withheld").xpath('.//svg[contains(@aria-label, "Cumulative")]')
     (curve,) = plot.xpath('.//path[contains(@class, "s0")]/@d')
     (pick, *_) = plot.xpath('.//path[contains(@class, "pick")]/@d')
@@ -141,7 +141,7 @@ def test_reference_errors_are_tabled_with_percentiles(dom, case) -> None:
     assert "Yaw 1.10 1" in words(section(dom, "reference").xpath(".//table")[2])
 
 
-def test_sections_stand_in_reading_order(dom) -> None:
+def test_sections_are_in_reading_order(dom) -> None:
     ids = [node.get("id") for node in dom.xpath("//header | //section")]
     assert ids == [
         *(
@@ -151,7 +151,7 @@ def test_sections_stand_in_reading_order(dom) -> None:
             "timeline",
             "statistics",
             "used",
-            "imu-holes",
+            "imu-gaps",
             "uncertainty",
             "motion",
             "attitude",
@@ -183,7 +183,7 @@ def test_statistics_of_motion_and_imu(dom, case) -> None:
     rate = np.degrees(np.linalg.norm(case.session.imu.gyro, axis=1))
     assert f"{speed.max():.1f} m/s" in text
     assert f"{rate.max():.1f} °/s at {rate.argmax() * 0.02:.1f} s" in text
-    assert "Standing still 21.5 s in 2 stops Of it at rest, without any motion 14.0 s" in text
+    assert "Standstills 2 stops, 21.5 s in all Of these completely at rest 14.0 s" in text
     slow = np.diff(case.solution.seconds)[(speed[1:] < 0.1) & (speed[:-1] < 0.1)].sum()
     assert f"Slower than 0.1 m/s {slow:.1f} s" in text
 
@@ -218,74 +218,74 @@ def test_acceleration_is_over_ground() -> None:
     assert accelerations(imu, solution, 9.81) == pytest.approx([2.0, 2.0], abs=1e-9)  # m/s^2
 
 
-def test_never_standing_still_is_told(tmp_path, case) -> None:
+def test_no_standstill_is_reported(tmp_path, case) -> None:
     none = summary() | {"standstills": {"count": 0, "total_s": 0.0, "at_rest_s": 0.0, "spans_s": []}}
-    assert "Standing still never found" in words(section(written(tmp_path, case, summary=none), "statistics"))
+    assert "Standstills none detected" in words(section(written(tmp_path, case, summary=none), "statistics"))
 
 
-def test_image_pairs_have_their_fate(dom) -> None:
+def test_image_pairs_by_outcome(dom) -> None:
     text = words(section(dom, "used"))
-    assert "100 image pairs Count Share In use 60 60 % The camera hardly moved between the two 39 39 %" in text
-    assert "Contradict the motion that the other sensors tell 1 1.0 %" in text
+    assert "100 image pairs Count Share In use 60 60 % Insufficient baseline 39 39 %" in text
+    assert "Inconsistent with the other sensors 1 1.0 %" in text
 
 
-def test_what_was_assumed_stands_apart(dom) -> None:
-    (row,) = section(dom, "used").xpath('.//tr[@data-assumed="vehicle"]')
-    assert [words(c) for c in row] == ["Vehicle", "460", "wheels do not slide sideways or leave the road"]
+def test_constraints_are_listed_apart_from_sensors(dom) -> None:
+    (row,) = section(dom, "used").xpath('.//tr[@data-model="vehicle"]')
+    assert [words(c) for c in row] == ["Vehicle constraint", "460", "wheels move neither sideways nor off the road"]
     assert not section(dom, "used").xpath('.//tr[@data-sensor="vehicle"]')
 
 
-def test_longest_stretch_without_a_fix(tmp_path, case) -> None:
+def test_longest_time_without_a_fix(tmp_path, case) -> None:
     r = case.solution.residuals
     late = r.of("gnss") & (r.t_ns > case.solution.t0_ns + 200 * 10**9) & (r.t_ns < case.solution.t0_ns + 263 * 10**9)
     dom = written(tmp_path, case, solution=replace(case.solution, residuals=replace(r, used=r.used & ~late)))
-    node = dom.get_element_by_id("silence")
+    node = dom.get_element_by_id("outage")
     assert (float(node.get("data-start-s")), float(node.get("data-length-s"))) == (200.0, 64.0)
-    assert words(node) == "The longest stretch without a GNSS fix in use is 64.0 s, from t = 200.0 s on."
+    assert words(node) == "Longest time without a position in use (GNSS): 64.0 s, from t = 200.0 s."
 
 
 def test_clocks_mounts_and_noise_one_number_a_row(dom) -> None:
     node = section(dom, "states")
     rows = {words(row[0]): [words(cell) for cell in row[1:]] for row in node.xpath(".//tbody/tr")}
     assert rows["GNSS time offset [s]"] == ["0.0612", "0.00310", "estimated"]
-    assert rows["GNSS lever arm, y [m]"] == ["−0.310", "–", "as given"]
-    assert rows["Vehicle's axes in the device, pitch [°]"] == ["−0.441", "0.0516", "estimated"]  # of -0.0077 rad
-    assert rows["Rear axle, left of the IMU [m]"] == ["−0.270", "1.45", "rests on its prior"]
+    assert rows["GNSS lever arm, y [m]"] == ["−0.310", "–", "fixed"]
+    assert rows["Vehicle mount, pitch [°]"] == ["−0.441", "0.0516", "estimated"]  # of -0.0077 rad
+    assert rows["Rear axle, left of the IMU [m]"] == ["−0.270", "1.45", "not observable (prior only)"]
     assert rows["GNSS 1 sigma, up [m]"] == ["1.20", "–", "estimated"]
-    told = [words(p) for p in node.find_class("clock")]
-    assert told == [
-        "GNSS: a GNSS fix was taken 61 ms later than its stamp (1 sigma 3.1 ms).",
-        "Images: an image was taken 4.0 ms earlier than its stamp (1 sigma 0.50 ms).",
+    sentences = [words(p) for p in node.find_class("clock")]
+    assert sentences == [
+        "GNSS: measured 61 ms later than the time stamp (1 sigma 3.1 ms).",
+        "Images: measured 4.0 ms earlier than the time stamp (1 sigma 0.50 ms).",
     ]
 
 
 def test_timeline_has_a_lane_for_what_there_was(dom, case) -> None:
     names = [words(t) for t in section(dom, "timeline").xpath('.//*[local-name()="text"][contains(@class, "note")]')]
-    assert names == ["GNSS in use, 4 rejected", "GNSS withheld", "Standing still", "IMU holes"]
+    assert names == ["GNSS in use, 4 rejected", "GNSS withheld", "Standstills", "IMU data gaps"]
     lanes = section(dom, "timeline").xpath('.//svg[@class="box"]/path[contains(@class, "lane")]')
-    holes = [p for p in lanes if "hole" in p.get("class")]
-    starts = [float(re.match(r"M(\d+)", p.get("d"))[1]) / 10_000 * 469 for p in holes]
-    assert starts == pytest.approx([h[0] for h in HOLES], abs=0.05)  # s, half a drawing unit
+    gaps = [p for p in lanes if "imu-gap" in p.get("class")]
+    starts = [float(re.match(r"M(\d+)", p.get("d"))[1]) / 10_000 * 469 for p in gaps]
+    assert starts == pytest.approx([h[0] for h in GAPS], abs=0.05)  # s, half a drawing unit
     assert len([p for p in lanes if "out" in p.get("class")]) == len(REJECTED)
 
 
-def test_a_rejection_beside_what_is_in_use_stands_on_the_timeline(case) -> None:
-    told = [{"t_s": 7.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}]
-    assert 8 not in REJECTED  # something of that instant is in use
-    (lane, *_) = lanes(case.solution, summary() | {"rejections": told, "rejected": {"gnss": 3}}, [], {})
+def test_a_rejection_at_the_time_of_a_used_one_is_on_the_timeline(case) -> None:
+    rejections = [{"t_s": 7.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}, {"t_s": 8.0, "sensor": "gnss"}]
+    assert 8 not in REJECTED  # something of that time is in use
+    (lane, *_) = lanes(case.solution, summary() | {"rejections": rejections, "rejected": {"gnss": 3}}, [], {})
     assert lane.name == "GNSS in use, 3 rejected"
     np.testing.assert_array_equal(lane.out, [7.0, 8.0])
 
 
 def test_the_total_of_a_report_says_that_writing_is_not_in_it() -> None:
     known = {"solve": 1.0, "total": 1.2}
-    assert [facts.step_name(name, known) for name in known] == ["Solve", "Total, without writing"]
-    assert facts.step_name("total", known | {"write": 0.5}) == "Total"
+    assert [facts.timing_name(name, known) for name in known] == ["Solve", "Total, without writing"]
+    assert facts.timing_name("total", known | {"write": 0.5}) == "Total"
 
 
 def test_too_many_rejections_are_a_warning(tmp_path, case) -> None:
     bad = summary() | {"used": {"gnss": 300}, "rejected": {"gnss": 170}}
-    assert "GNSS: 170 of 470 GNSS fixes rejected, too many for outliers" in words(
+    assert "GNSS: 170 of 470 measurements rejected, too many for outliers" in words(
         section(written(tmp_path, case, summary=bad), "warnings")
     )
     assert "too many" not in words(section(written(tmp_path, case), "warnings"))
@@ -295,35 +295,36 @@ def test_many_rejections_in_a_row_are_a_warning(tmp_path, case) -> None:
     r = case.solution.residuals
     end = r.of("gnss") & (r.t_ns >= case.solution.t0_ns + 440 * 10**9)
     dom = written(tmp_path, case, solution=replace(case.solution, residuals=replace(r, used=r.used & ~end)))
-    assert "GNSS: 15 GNSS fixes in a row rejected, from 440.0 s to 468.0 s; outliers do not come like this" in words(
-        section(dom, "warnings")
+    assert (
+        "GNSS: 15 measurements in a row rejected, from 440.0 s to 468.0 s; outliers are not that many in a row"
+        in words(section(dom, "warnings"))
     )
     assert "in a row" not in words(section(written(tmp_path, case), "warnings"))
 
 
-def test_errors_far_beyond_the_sigmas_are_told_in_words(tmp_path, case) -> None:
+def test_errors_far_beyond_the_sigmas_are_a_sentence(tmp_path, case) -> None:
     table = case.evaluation.to_dict()
-    assert "After alignment it says little" in facts.nees_sentence(table)
-    told = facts.nees_sentence(table | {"align": "none", "nees": {"position": 75.0, "attitude": 3.1}})
-    assert "position errors are 5.0 times their sigma. Either the sigmas are too small" in told
-    assert "attitude" not in told
-    assert "as large as they should be" in facts.nees_sentence(table | {"align": "none"})
+    assert "After alignment it is not meaningful" in reference.nees_sentence(table)
+    text = reference.nees_sentence(table | {"align": "none", "nees": {"position": 75.0, "attitude": 3.1}})
+    assert "position errors are 5.0 times their sigma. Either the sigmas are too small" in text
+    assert "attitude" not in text
+    assert "as large as the errors" in reference.nees_sentence(table | {"align": "none"})
 
 
-def test_careful_noise_is_no_warning_but_told(tmp_path, case) -> None:
+def test_noise_set_too_large_is_reported_without_a_warning(tmp_path, case) -> None:
     small = summary() | {"chi2_per_dof": {"overall": 0.18, "imu": 0.06, "gnss": 1.1}, "warnings": []}
     dom = written(tmp_path, case, summary=small)
     assert "No warnings." in words(section(dom, "warnings"))
-    assert "The residuals of IMU are smaller than the stated noise explains" in words(section(dom, "used"))
+    assert "The residuals of IMU are smaller than the stated noise" in words(section(dom, "used"))
 
 
 def test_updates_of_a_replay(dom, tmp_path, case) -> None:
     node = section(dom, "updates")
     rows = {words(row[0]): [words(cell) for cell in row[1:]] for row in node.xpath(".//tbody/tr")}
     assert rows["Computing time"] == ["3.00 ms", "4.96 ms", "5.00 ms"]  # of 1 .. 5 ms
-    assert rows["Correction of the past"][2] == "3.00 m"
+    assert rows["Change of earlier states"][2] == "3.00 m"
     titles = [words(t) for t in node.xpath('.//*[local-name()="text"][contains(@class, "ty0")]')]
-    assert titles[0] == "Correction of the past [m]" and titles[-1] == "GNSS time offset [ms]"
+    assert titles[0] == "Change of earlier states [m]" and titles[-1] == "GNSS time offset [ms]"
     ticks = node.xpath('(.//svg[contains(@class, "plot")])[1]/*[local-name()="text"][@class="tick ty"]/text()')
     assert ticks[0] == "0.0001"  # m; rounding errors are not drawn as they are
     assert not written(tmp_path, case).xpath('//section[@id="updates"]')
@@ -331,8 +332,8 @@ def test_updates_of_a_replay(dom, tmp_path, case) -> None:
 
 def test_empty_summary_claims_nothing(tmp_path, case) -> None:
     dom = written(tmp_path, case, summary={})
-    assert "The run did not record IMU holes." in words(section(dom, "imu-holes"))
-    assert section(dom, "imu-holes").get("data-count") is None
+    assert "The run did not record IMU data gaps." in words(section(dom, "imu-gaps"))
+    assert section(dom, "imu-gaps").get("data-count") is None
     assert "did not record what was rejected" in words(section(dom, "used"))
     assert "no measurement was rejected" not in words(dom).lower()
     assert not dom.xpath('//section[@id="withheld" or @id="timings" or @id="versions"]')
@@ -341,12 +342,12 @@ def test_empty_summary_claims_nothing(tmp_path, case) -> None:
 def test_clean_run_says_so(tmp_path, case) -> None:
     clean = summary() | {"gaps": [], "rejected": {}, "dropped": {}, "warnings": []}
     dom = written(tmp_path, case, summary=clean)
-    assert "No measurement was rejected; the IMU record has no holes." in words(section(dom, "headline"))
+    assert "No measurement was rejected. No IMU data gaps." in words(section(dom, "headline"))
     assert "No warnings." in words(section(dom, "warnings"))
-    assert section(dom, "imu-holes").get("data-count") == "0"
+    assert section(dom, "imu-gaps").get("data-count") == "0"
 
 
-def test_failed_solve_stands_in_headline_and_warnings(tmp_path, case) -> None:
+def test_failed_solve_is_in_headline_and_warnings(tmp_path, case) -> None:
     bad = summary() | {"converged": False, "chi2_per_dof": {"overall": 6.2}}
     dom = written(tmp_path, case, summary=bad)
     assert "The solver did not converge: do not rely on this result." in words(section(dom, "headline"))
@@ -357,17 +358,17 @@ def test_failed_solve_stands_in_headline_and_warnings(tmp_path, case) -> None:
 
 def test_dead_reckoning_is_named(tmp_path, case) -> None:
     dom = written(tmp_path, case, summary={"mode": "dead-reckoning"})
-    assert "nothing ties it to an absolute position" in words(section(dom, "headline"))
+    assert "there is no absolute position measurement" in words(section(dom, "headline"))
 
 
-def test_replay_tells_its_kind_delay_and_polish(tmp_path, case) -> None:
+def test_replay_has_its_kind_delay_and_final_solution(tmp_path, case) -> None:
     polish = {"largest_change_m": 0.0213, "largest_change_deg": 0.05, "passes": 2}
     extra = {"mode": "replay fixed-lag, interrupted", "delay_s": 29.9, "polish": polish}
     dom = written(tmp_path, case, summary=summary() | extra)
     assert "was replayed one window at a time (fixed-lag, interrupted)" in words(section(dom, "headline"))
     text = words(section(dom, "solver"))
-    assert "Data seen before the first output 29.9 s" in text
-    assert "final polish 0.021 m, 0.0500°" in text
+    assert "Data used before the first output 29.9 s" in text
+    assert "final batch solution 0.021 m, 0.0500°" in text
 
 
 def test_bare_solution(tmp_path, case) -> None:
@@ -376,14 +377,14 @@ def test_bare_solution(tmp_path, case) -> None:
         case.solution, residuals=Residuals.empty(), origin=None, covariance=case.solution.covariance * np.nan
     )
     dom = written(tmp_path, case, session=Session(), solution=bare, summary={"gaps": None, "withheld": None})
-    assert "gives no position uncertainty" in words(section(dom, "sigma-at"))
+    assert "The position uncertainty is unknown" in words(section(dom, "sigma-at"))
     assert "recorded no residuals" in words(section(dom, "residuals"))
     assert "nan" not in words(dom).lower()
     assert not any("nan" in d for d in dom.xpath("//path/@d"))
     one = {name: getattr(bare, name)[:1] for name in ("t_ns", "nav_R_body", "nav_t_body", "nav_v_body")}
     one |= {name: getattr(bare, name)[:1] for name in ("accel_bias", "gyro_bias", "covariance")}
     dom = written(tmp_path, case, session=Session(), solution=replace(bare, **one), summary={})
-    assert "no path to draw" in words(section(dom, "map"))
+    assert "has no path" in words(section(dom, "map"))
 
 
 def test_37_minutes_stay_small_and_quick(tmp_path) -> None:
@@ -405,7 +406,7 @@ def test_markdown_carries_the_same_facts(case) -> None:
     text = report_markdown(case.summary, case.evaluation)
     assert "was smoothed in one batch at 470 epochs" in text
     assert "| GNSS | 231 | 4 | 235 | 2 | 1.11 |" in text
-    assert "- IMU hole at 36.4 s, 1.59 s, bridged by interpolation" in text
+    assert "- IMU data gap at 36.4 s, 1.59 s, linearly interpolated" in text
     assert "| GNSS | 235 | 0.284 m | 0.410 m | 1.32 m |" in text
     assert "Started while moving" in text
     assert report_markdown({}).startswith("# Run report\n\nThe recording was smoothed.")

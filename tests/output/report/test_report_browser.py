@@ -97,7 +97,7 @@ def test_real_run(browser: Any, kitti_run: Path, width: int, scheme: str) -> Non
     tab = look(browser, kitti_run / "report.html", width, scheme)
     summary = json.loads((kitti_run / "summary.json").read_text(encoding="utf-8"))
 
-    holes = tab.evaluate("[...document.querySelectorAll('#imu-holes .hole')].map(h => h.textContent)")
+    holes = tab.evaluate("[...document.querySelectorAll('#imu-gaps .imu-gap')].map(h => h.textContent)")
     told = [[float(x) for x in re.findall(r"([\d.]+) s", hole)] for hole in holes]
     assert len(told) == 9
     assert told == [[pytest.approx(g["start_s"], abs=0.05), pytest.approx(g["length_s"], abs=0.005)]

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import html
-from smartnav_graph.output.report.text import Row, Table, count, distance, duration, number
 
 from smartnav_graph.output.report.svg import Plot, axis, exact_axis, log_axis, spread_axis, time_axis
 from smartnav_graph.output.report.thin import thin_band, thin_dots, thin_line, thin_path
 from smartnav_graph.output.report.track import _axes
+from smartnav_graph.output.text import Row, Table, count, distance, duration, number
 
 
 @settings(max_examples=60, deadline=None)
@@ -44,10 +44,10 @@ def test_time_and_log_ticks_are_what_people_expect() -> None:
     assert spread_axis([0.1, 0.2]).log is False and spread_axis([0.1, 20.0]).log is True
 
 
-def test_long_labels_are_told_less_an_offset_or_by_powers() -> None:
+def test_long_labels_have_an_offset_or_powers() -> None:
     high = axis([1234.551, 1234.598])
     assert high.offset == pytest.approx(1234.5) and high.labels[0] == "0.05"
-    assert high.titled("Height [m]") == "Height [m], less 1\u202f234.5"
+    assert high.titled("Height [m]") == "Height [m], minus 1\u202f234.5"
     assert axis([-4e6, 5e6]).labels == ("−4e6", "−2e6", "0", "2e6", "4e6", "6e6")
     assert log_axis([3e-7, 2e6]).labels[0] == "1e−7"
 

@@ -30,9 +30,9 @@ def recording(runs, tmp_path_factory):
 
 def test_differences_row_by_row_with_the_larger_sigma(runs, recording):
     first, second = runs
-    values = recording.values("/apart/position", "Measurements:values")
+    values = recording.values("/difference/position", "Measurements:values")
     np.testing.assert_allclose(values, second.nav_t_body - first.nav_t_body, atol=1e-6)
-    variances = recording.values("/apart/position", "Measurements:variances")
+    variances = recording.values("/difference/position", "Measurements:variances")
     np.testing.assert_allclose(variances, second.sigmas[:, 3:6] ** 2, rtol=1e-6)
 
 
@@ -46,7 +46,7 @@ def test_both_paths_and_what_each_plot_needs(runs, recording):
 
 def test_time_lines_of_every_row(runs, recording):
     for timeline in ("elapsed", "utc"):
-        stamps = recording.index("/apart/position", "Measurements:values", timeline)
+        stamps = recording.index("/difference/position", "Measurements:values", timeline)
         assert stamps[7] - stamps[0] == runs[0].t_ns[7] - runs[0].t_ns[0], timeline
 
 
@@ -69,4 +69,4 @@ def test_views_name_the_runs(recording):
 def test_equal_runs_have_no_difference_to_magnify(runs, tmp_path):
     first, _ = runs
     write_comparison(tmp_path / "same.rrd", first, first, compare(first, first))
-    assert "/apart/position" in Recording(tmp_path / "same.rrd").paths
+    assert "/difference/position" in Recording(tmp_path / "same.rrd").paths

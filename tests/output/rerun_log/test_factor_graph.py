@@ -58,7 +58,7 @@ def test_no_node_lies_on_another():
 def test_each_moment_shows_the_last_keyframes(tmp_path, monkeypatch):
     monkeypatch.setattr(factor_graph, "DEPTH", 2)
     t = make_solution().t_ns[:3]
-    found = write(tmp_path / "run.rrd", trace=Diagnostics(t, wired()))
+    found = write(tmp_path / "run.rrd", diagnostics=Diagnostics(t, wired()))
     labels = found.rows("/graph", "GraphNodes:labels")
     assert [("pose 0" in row, "pose 2" in row) for row in labels] == [(True, False), (True, False), (False, True)]
     assert found.index("/graph", "GraphNodes:node_ids", "keyframe").tolist() == [0, 1, 2]

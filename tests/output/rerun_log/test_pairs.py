@@ -1,4 +1,4 @@
-"""Matches of image pairs over their images, told apart by what became of them."""
+"""Matches of image pairs over their images, by their use."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def trace_of(verdict=VERDICT):
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("pairs") / "run.rrd", session=seen_session(), trace=trace_of())
+    return write(tmp_path_factory.mktemp("pairs") / "run.rrd", session=seen_session(), diagnostics=trace_of())
 
 
 PATH = "/world/est/body/cam0/image/matches"
@@ -131,7 +131,7 @@ def test_matches_of_a_session_are_shown_before_it_is_solved(tmp_path):
 
 def test_legend_says_what_the_colours_of_matches_mean(found):
     legend = found.rows("/legend", "TextDocument:text", static=True)[0][0]
-    assert f"* [{PATH}](recording:/{PATH}): **lines** from where a point was" in legend
+    assert f"* [{PATH}](recording:/{PATH}): **lines** from a point in the first image" in legend
     assert "/pairs/matches" not in legend
 
 

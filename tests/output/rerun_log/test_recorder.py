@@ -137,7 +137,7 @@ def test_what_is_unknown_does_not_make_equal_recordings_differ(tmp_path):
         "solution": make_solution(residuals=ragged),
         "evaluation": SimpleNamespace(**(vars(EVALUATION) | {"rotation_error_deg": rotation})),
         "summary": {"states": {"gnss_time_offset_s": {"value": 0.06, "sigma": 0.01, "held": False}}},
-        "trace": replayed(states={"gnss_time_offset_s": followed}),
+        "diagnostics": replayed(states={"gnss_time_offset_s": followed}),
         "causal": make_solution(),
     }
     found = write(tmp_path / "a.rrd", **changes)

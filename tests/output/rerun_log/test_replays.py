@@ -14,7 +14,7 @@ from smartnav_graph.output.rerun_log import replays, viewer, write_latency
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("replay") / "run.rrd", causal=causal(), trace=replayed())
+    return write(tmp_path_factory.mktemp("replay") / "run.rrd", causal=causal(), diagnostics=replayed())
 
 
 def causal():
@@ -40,15 +40,15 @@ def test_causal_estimate_of_the_moment_with_its_ellipsoid(found):
     np.testing.assert_array_equal(centres, now)
 
 
-def test_updates_tell_effort_correction_and_doubts(found):
+def test_updates_have_effort_change_and_rejections(found):
     effort = found.values("/update/effort", "Scalars:scalars")
     np.testing.assert_array_equal(effort, np.column_stack([np.arange(N), 2 * np.arange(N)]))
-    np.testing.assert_array_equal(found.values("/update/correction", "Scalars:scalars")[:, 0], updates().corrected)
+    np.testing.assert_array_equal(found.values("/update/change", "Scalars:scalars")[:, 0], updates().corrected)
     assert found.index("/update/rejected", "Scalars:scalars", "keyframe").tolist() == [0, 10, 20, 30]
     assert {
         "Updates: states (latency ms in latency.rrd)",
-        "Correction of the past m",
-        "Rejected rows by update",
+        "Change of earlier states m",
+        "Rejected measurements by update",
     } <= set(found.view_names())
 
 
@@ -61,15 +61,15 @@ def test_a_long_window_is_thinned_to_its_ends():
 def test_latency_stands_in_a_recording_beside_that_the_viewer_joins(tmp_path):
     """Two replays of the same session differ in nothing but their wall times: run.rrd compares equal."""
     slow = replayed(latency_ms=np.full(N, 50.0))
-    one = write(tmp_path / "one.rrd", causal=causal(), trace=replayed())
-    other = write(tmp_path / "other.rrd", causal=causal(), trace=slow)
+    one = write(tmp_path / "one.rrd", causal=causal(), diagnostics=replayed())
+    other = write(tmp_path / "other.rrd", causal=causal(), diagnostics=slow)
     assert one.identity == other.identity
     binary = str(viewer.executable())
     command = [binary, "rrd", "compare", str(tmp_path / "one.rrd"), str(tmp_path / "other.rrd")]
     compared = subprocess.run(command, capture_output=True, text=True)
     assert compared.returncode == 0, compared.stderr
     assert "/update/latency" not in one.paths
-    write_latency(tmp_path / "latency.rrd", session=make_session(), trace=slow, identity=one.identity)
+    write_latency(tmp_path / "latency.rrd", session=make_session(), diagnostics=slow, identity=one.identity)
     beside = Recording(tmp_path / "latency.rrd")
     assert (beside.identity, beside.application) == (one.identity, one.application)
     np.testing.assert_array_equal(beside.values("/update/latency", "Scalars:scalars"), np.full((N, 1), 50.0))
@@ -81,5 +81,5 @@ def test_latency_stands_in_a_recording_beside_that_the_viewer_joins(tmp_path):
 def test_identity_follows_all_else_of_the_updates(tmp_path, found, name):
     changed = getattr(updates(), name).copy()
     changed[5] += 1
-    other = write(tmp_path / "run.rrd", causal=causal(), trace=replayed(**{name: changed}), evaluation=EVALUATION)
+    other = write(tmp_path / "run.rrd", causal=causal(), diagnostics=replayed(**{name: changed}), evaluation=EVALUATION)
     assert other.identity != found.identity

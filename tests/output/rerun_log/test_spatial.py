@@ -98,7 +98,7 @@ def test_without_origin_the_path_is_seen_from_above_and_far_coordinates_keep_cen
     at = found.values("/world/est/body", "Transform3D:translation")[:, 0].astype(float)
     assert np.abs(at - (truth(np.arange(N)) + far - [691_000.0, 5_334_000.0, 0.0])).max() < 1e-3  # m
     texts = found.texts("/log", "TextLog:text")
-    assert [text for text in texts if "less 691000, 5334000, 0 m" in text]
+    assert [text for text in texts if "minus 691000, 5334000, 0 m" in text]
 
 
 def test_unknown_positions_are_left_out_of_the_scene(tmp_path):

@@ -26,20 +26,22 @@ def test_clock_offset_is_drawn_over_the_whole_session_with_its_bands(tmp_path):
 
 
 def test_in_a_replay_it_is_drawn_as_each_update_has_it(tmp_path):
-    found = write(tmp_path / "run.rrd", summary={"states": FOUND}, causal=make_solution(), trace=replayed())
+    found = write(tmp_path / "run.rrd", summary={"states": FOUND}, causal=make_solution(), diagnostics=replayed())
     followed = updates().states["gnss_time_offset_s"]
     np.testing.assert_array_equal(found.values("/clock/gnss", "Measurements:values")[:, 0], followed[:, 0])
     np.testing.assert_allclose(found.values("/clock/gnss", "Measurements:variances")[:, 0], followed[:, 1] ** 2)
-    np.testing.assert_array_equal(found.values("/clock/gnss/found", "Measurements:values"), [[0.06]] * 2)
+    np.testing.assert_array_equal(found.values("/clock/gnss/final", "Measurements:values"), [[0.06]] * 2)
 
 
-def test_every_state_stands_in_the_table(tmp_path):
+def test_every_state_is_in_the_table(tmp_path):
     found = write(tmp_path / "run.rrd", summary={"states": FOUND})
     text = found.rows("/states", "TextDocument:text", static=True)[0][0]
     assert "| GNSS time offset [s] | 0.0600 | 0.00200 | estimated |" in text
-    (unseen,) = [line for line in text.splitlines() if line.endswith("| 0.300 | 0.0100 | rests on its prior |")]
+    (unseen,) = [
+        line for line in text.splitlines() if line.endswith("| 0.300 | 0.0100 | not observable (prior only) |")
+    ]
     assert unseen.startswith("| GNSS lever arm") and "[m]" in unseen
-    assert "| Accelerometer noise density [m/s²/√Hz] | 0.00300 | – | as given |" in text
+    assert "| Accelerometer noise density [m/s²/√Hz] | 0.00300 | – | fixed |" in text
     assert "States of the session" in found.view_names()
 
 

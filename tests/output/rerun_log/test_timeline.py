@@ -36,7 +36,7 @@ def test_states_switch_at_gaps_outages_and_standstills(recording):
     np.testing.assert_allclose(times, [0, OUTAGE[0] - 1, OUTAGE[1]])
     assert recording.texts("/status/imu", component) == ["recorded", "missing", "recorded"]
     np.testing.assert_allclose(recording.index("/status/imu", component, "elapsed") / NS, [0, 24.98, 26.5])
-    assert recording.texts("/status/motion", component) == ["still", "moving"]
+    assert recording.texts("/status/motion", component) == ["standstill", "moving"]
     gate = recording.index("/status/gnss_gate", component, "elapsed") / NS
     assert gate[1] == make_session().seconds(make_session().gnss.t_ns)[REJECTED_ROWS[0]]
 
@@ -46,8 +46,8 @@ def test_log_tells_warnings_initialisation_gaps_and_rejections_in_order(recordin
     times = recording.index("/log", "TextLog:text", "elapsed")
     assert (np.diff(times) >= 0).all()
     assert "gnss: sigmas missing" in texts
-    assert "initialised: mode dynamic, heading_deg 12.5" in texts
-    assert times[texts.index("imu: missing for 1.52 s")] == 24_980_000_000
+    assert "initialisation: started while moving" in texts
+    assert times[texts.index("IMU data gap: no samples for 1.52 s")] == 24_980_000_000
     assert times[texts.index("gnss: fix rejected at 7.00 s")] == 7 * NS
     assert times[texts.index("gnss: no fix used for 9.0 s")] == (OUTAGE[0] - 1) * NS
 
