@@ -26,7 +26,7 @@ def test_session_alone_shows_what_was_recorded(tmp_path):
     left, right = {"Path (ENU)", "Legend", "Map"}, {"Accelerometer m/s²", "Gyroscope rad/s", "States", "Log"}
     assert set(found.view_names()) == left | right
     gap = found.texts("/status/imu", "StateChange:state")
-    assert gap == ["recorded", "missing", "recorded"]  # found in the stream itself
+    assert gap == ["recorded", "no samples", "recorded"]  # found in the stream itself
 
 
 def test_eye_sees_every_point():

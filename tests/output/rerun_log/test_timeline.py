@@ -34,7 +34,7 @@ def test_states_switch_at_gaps_outages_and_standstills(recording):
     assert recording.texts("/status/gnss", component) == ["fix", "outage", "fix"]
     times = recording.index("/status/gnss", component, "elapsed") / NS
     np.testing.assert_allclose(times, [0, OUTAGE[0] - 1, OUTAGE[1]])
-    assert recording.texts("/status/imu", component) == ["recorded", "missing", "recorded"]
+    assert recording.texts("/status/imu", component) == ["recorded", "no samples", "recorded"]
     np.testing.assert_allclose(recording.index("/status/imu", component, "elapsed") / NS, [0, 24.98, 26.5])
     assert recording.texts("/status/motion", component) == ["standstill", "moving"]
     gate = recording.index("/status/gnss_gate", component, "elapsed") / NS
