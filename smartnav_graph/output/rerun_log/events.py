@@ -42,7 +42,7 @@ def find(session: Session, solution: Solution | None, summary: Summary) -> Event
     return Events(
         start_ns=start,
         end_ns=end,
-        gaps=imu_gaps(session, summary),
+        gaps=gap_spans(session, summary),
         outages=outages(fixes, start, end) if session.gnss is not None else [],
         standstills=_standstills(session, summary),
         use=use,
@@ -69,7 +69,7 @@ def span(session: Session, solution: Solution | None) -> tuple[int, int]:
     return min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
 
 
-def imu_gaps(session: Session, summary: Summary) -> list[Gap]:
+def gap_spans(session: Session, summary: Summary) -> list[Gap]:
     """IMU data gaps of the summary, else those found in the inertial stream."""
     if "gaps" in summary:
         gaps = summary_json.imu_gaps(summary)
