@@ -13,6 +13,7 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import FACTORS
 from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.pose_fix import undo_latency
+from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.apply import corrected
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
@@ -28,11 +29,12 @@ from smartnav_graph.vision.zero_motion import static_periods
 class Notes:
     """What the steps find beside the session.
 
-    span : first and last stamp to smooth; gaps : of the inertial data inside it
+    causal : for a replay; span : first and last stamp to smooth; gaps : of the inertial data inside it
     withheld : rows held out, by stream; dropped : rows that are not used, by stream and reason
     """
 
     config: Config
+    causal: bool = False
     span: tuple[int, int] = (0, 0)
     gaps: Sequence[Gap] = ()
     calibration: Calibration = field(default_factory=Calibration)
@@ -172,7 +174,8 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     noise, options = notes.calibration.imu_noise, notes.config.standstill
     seen = None if notes.pairs is None else static_periods(notes.pairs)
     imu, gravity = session.require_imu(), session.gravity
-    notes.rests = find_standstills(imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen)
+    known_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None
+    notes.rests = find_standstills(imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen, known_ns)
     return session
 
 

@@ -83,7 +83,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     ConfigError
         An option names what is not there.
     """
-    notes = Notes(config)
+    notes = Notes(config, causal)
     for step in PREPARE.values():
         session = step(session, notes)
     context = FactorContext(
@@ -112,28 +112,33 @@ def session_windows(context: FactorContext, span: tuple[int, int]) -> tuple[list
     rests = context.rests or Standstills.none(session.require_imu().t_ns)
     if rests.on_foot:  # a foot swings fast: between keyframes too far apart its motion is lost
         spacing = replace(spacing, max_spacing_s=min(spacing.max_spacing_s, SWING_S))
-    standing = rests.keyframes(STANCE_SPACING_S if rests.on_foot else None)
+    standing = rests.keyframes(STANCE_SPACING_S if rests.on_foot else None, causal=causal)
     merge = round(spacing.merge_s * NS)
     streams = session.absolute()
     aiding = {name: stream.t_ns for name, stream in streams.items()}
     epochs = [stream.available_ns if causal else stream.t_ns for stream in streams.values()] + [context.image_ns]
-    times = keyframe_times(span, epochs, context.gaps, spacing, standing)
+    times = keyframe_times(span, epochs, context.gaps, spacing, standing, causal=causal)
     imu = bridged(session.require_imu(), context.gaps, context.bridges)
     windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
     return delayed.assign(windows, streams, merge) if causal else (windows, {})
 
 
 def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
-    """The same stretch for a batch solution: every row at its measurement time, gaps bridged by all that was recorded.
-    Only rows known by `available_ns` where that is given; the problem itself where there is no difference."""
-    session, config, gaps = problem.session, problem.config, problem.gaps
-    merge = round(config.keyframes.merge_s * NS)
-    if not gaps and not any(delayed.is_delayed(stream, merge).any() for stream in session.absolute().values()):
-        return problem
+    """The problem of a replay for a batch solution: every row at its measurement time, keyframes, gaps and builders by
+    all that was recorded. Only rows known by `available_ns` where that is given; the problem itself where there is no difference."""
     context = FactorContext(
-        session, problem.calibration, gaps, problem.vehicle, config, problem.rests, pairs=problem.pairs
+        *(problem.session, problem.calibration, problem.gaps, problem.vehicle, problem.config, problem.rests),
+        pairs=problem.pairs,
     )
     windows, _ = session_windows(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
+    merge = round(problem.config.keyframes.merge_s * NS)
+    delays = any(delayed.is_delayed(stream, merge).any() for stream in problem.session.absolute().values())
+    if not (problem.gaps or delays) and [w.t1_ns for w in windows] == [w.t1_ns for w in problem.windows]:
+        if not any(builder.causal for builder in problem.builders):
+            return problem
+        made = {builder.name: builder for builder in make_builders(context)}
+        kept = [made.get(b.name) if b.causal else b for b in problem.builders]
+        return replace(problem, builders=[builder for builder in kept if builder is not None])
     if available_ns is not None:
-        windows = delayed.drop_unknown(windows, session.streams(), available_ns)
+        windows = delayed.drop_unknown(windows, problem.session.streams(), available_ns)
     return replace(problem, windows=windows, builders=make_builders(context))

@@ -12,7 +12,7 @@ from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import Clock, run_pass, solve_passes
-from smartnav_graph.estimate.problem import TOO_LATE, Problem, batch_problem, prepare
+from smartnav_graph.estimate.problem import LONGEST_INITIALISATION_S, TOO_LATE, Problem, batch_problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     carried_over,
     causal_solution,
@@ -43,7 +43,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     problem = prepare(session, config or Config(), causal=True)
     clock.lap("prepare")
     progress("finding the start", 0, 0)
-    initial = initialise(problem, longest_s=30.0)
+    initial = initialise(problem, longest_s=LONGEST_INITIALISATION_S)
     clock.lap("initialise")
     smoother = incremental(problem.config.replay, problem.session.t0_ns)
     builders, log = [initial.prior.with_position(), *problem.builders], UpdateLog(smoother)
@@ -58,10 +58,12 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     problem = _counted(replace(problem, windows=problem.windows[:count]), smoother.dropped)
     estimate, causal, updates = smoother.estimate(count), causal_solution(problem, log.states), log.updates()
     causal_windows = problem.windows
+    lookahead_s = max((builder.lookahead_s for builder in problem.builders), default=0.0)
     extra: dict[str, Any] = {
         "mode": f"replay {problem.config.replay.smoother}" + (", interrupted" if interrupted else ""),
         "update_ms": {name: float(f(log.latency_ms)) for name, f in _LATENCY.items()},
-        "delay_s": initial.stretch_s,
+        "delay_s": max(initial.stretch_s, lookahead_s),
+        "lookahead_s": lookahead_s,
     }
     if problem.config.replay.polish:
         try:

@@ -104,6 +104,7 @@ class BarometerBuilder(Builder):
     loss: str
     name: str = "barometer"
     stage: int = 0
+    lookahead_s: float = HALF_S
     _start: float = 0.0
 
     def begin(self) -> BarometerBuilder:

@@ -34,7 +34,7 @@ from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import StepNoise
-from smartnav_graph.session.detect.steps import Steps, find_steps, regular_share
+from smartnav_graph.session.detect.steps import LOOKAHEAD_S, Steps, find_steps
 
 WALK = 0.3  # share of regular steps from which a device that nothing is said of is in the hand of a walker
 GOOD_FIX_M = 0.3
@@ -102,7 +102,8 @@ def model_of(forward: str, up: str) -> Stride:
 class StepBuilder(Builder):
     """Adds one row a window in which steps are known and fixes are far apart.
 
-    fixes_ns : stamps of good fixes, in time order; note : what the run is told of it
+    fixes_ns : stamps of good fixes, in time order; start_ns : of the recording; causal : see `walks`; note : a warning
+    for the run
     """
 
     steps: Steps
@@ -111,8 +112,11 @@ class StepBuilder(Builder):
     noise: StepNoise
     config: StepConfig = field(default_factory=StepConfig)
     note: str = ""
+    start_ns: int = 0
+    causal: bool = False
     name: str = "steps"
     stage: int = 0
+    lookahead_s: float = LOOKAHEAD_S
 
     @property
     def state(self) -> SessionState:
@@ -125,6 +129,8 @@ class StepBuilder(Builder):
         """The row of one window; none in gaps, upside down, or between dense fixes."""
         if previous is None or window.kind == "gap" or not self._sparse(window, pass_state):
             return
+        if not self.walks(window.t1_ns):
+            return
         R = previous.nav.attitude().matrix() @ self.model.body_R_vehicle
         if 1.0 + R[2, 2] < LEAST_UPRIGHT:
             return
@@ -133,6 +139,13 @@ class StepBuilder(Builder):
         keys = (key("X", window.index - 1), key("X", window.index), update.use(self.state))
         data = np.array([[length.real, length.imag, sigma]])
         update.blocks.append(FactorBatch(self.name, self.model, [keys], data, window.t1_ns, loss="huber"))
+
+    def walks(self, t_ns: int) -> bool:
+        """Whether the steps up to a time show a walk; always where it is declared, or shown by the whole recording."""
+        if not self.causal:
+            return True
+        count = int(np.searchsorted(self.steps.end_ns, t_ns, side="right"))
+        return count > 0 and bool(self.steps.regular_seconds[count - 1] >= WALK * (t_ns - self.start_ns) / NS)
 
     def _length(self, window: Window, R: Floats, gyro_bias: Floats) -> complex:
         """S of one window."""
@@ -171,17 +184,22 @@ def build(context: FactorContext) -> StepBuilder | None:
         return None
     imu = session.require_imu()
     steps = find_steps(imu)
-    share = regular_share(steps, float(session.seconds(imu.t_ns[-1])))
     declared = config.enabled == "on" or context.vehicle == "foot"
-    if not (declared or share >= WALK):
+    share = steps.regular_seconds / session.seconds(steps.end_ns if context.causal else imu.t_ns[-1])
+    if not (declared or share.max(initial=0.0) >= WALK):
         return None
-    note = (
-        f"steps: a walk ({len(steps)} steps, {100 * share:.0f} % of the time regular); used between fixes that are far "
-        "apart, give --vehicle if it is none, or --steps.enabled off"
-    )
+    note = "" if declared else _note(len(steps), float(share[-1]))
     model = model_of(session.device.forward, session.device.up)
     noise = context.calibration.step_noise
-    return StepBuilder(steps, _good_fixes(context), model, noise, config, "" if declared else note)
+    causal = context.causal and not declared
+    return StepBuilder(steps, _good_fixes(context), model, noise, config, note, session.t0_ns, causal)
+
+
+def _note(count: int, share: float) -> str:
+    return (
+        f"steps: a walk ({count} steps, {100 * share:.0f} % of the time regular); used between fixes that are far "
+        "apart, give --vehicle if it is none, or --steps.enabled off"
+    )
 
 
 def _good_fixes(context: FactorContext) -> NDArray[np.int64]:

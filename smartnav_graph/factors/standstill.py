@@ -29,7 +29,7 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.session.detect.standstills import StandstillConfig, Standstills
+from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, StandstillConfig, Standstills
 
 TAIL = 4.0
 # In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second; in metres a second.
@@ -73,6 +73,7 @@ class StandstillBuilder(Builder):
     config: StandstillConfig = field(default_factory=StandstillConfig)
     name: str = "static"
     stage: int = 0
+    lookahead_s: float = LOOKAHEAD_S
     _floor: SessionState | None = None
 
     def begin(self) -> StandstillBuilder:

@@ -34,7 +34,7 @@ from smartnav_graph.graph.states import STATES, SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import VEHICLE_CLASSES, VehicleNoise
-from smartnav_graph.session.detect.standstills import Standstills
+from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, Standstills
 
 MOUNT_SIZE = STATES["M"].dim
 # Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken: a mean,
@@ -205,6 +205,7 @@ class VehicleBuilder(Builder):
     config: VehicleConfig = VehicleConfig()
     name: str = "vehicle"
     stage: int = 1
+    lookahead_s: float = LOOKAHEAD_S
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))

@@ -99,7 +99,8 @@ class WheelBuilder(Builder):
     """Adds one row a period where readings surround the keyframe.
 
     body_R_vehicle (3, 3) : declared axes; default_sigma : m/s, of readings that carry none. Such a sigma stands for
-    slip and quantisation, which do not average out; a reading's own is taken as white.
+    slip and quantisation, which do not average out; a reading's own is taken as white. causal : whether speeds have a
+    sign is known from the readings so far, not from all.
     """
 
     stream: WheelSpeed
@@ -107,13 +108,15 @@ class WheelBuilder(Builder):
     default_sigma: float
     config: WheelConfig
     vehicle: VehicleConfig
+    causal: bool = False
     name: str = "wheel"
     stage: int = 1
     lookahead_s: float = HALF_LINE_S
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(RearWheels(self.body_R_vehicle))
-        self._unsigned = bool((self.stream.speed >= 0).all())
+        negative = self.stream.t_ns[self.stream.speed < 0]
+        self._first_negative_ns = int(negative[0]) if len(negative) else None
 
     @property
     def noise_groups(self) -> Mapping[str, float]:
@@ -129,13 +132,18 @@ class WheelBuilder(Builder):
             return
         speed, slope, sigma = line
         ahead = self.body_R_vehicle[:, 0] @ update.predicted.attitude().matrix().T @ update.predicted.velocity()
-        sign = -1.0 if self._unsigned and ahead < -REVERSING else 1.0
+        sign = -1.0 if self._unsigned(window.t1_ns) and ahead < -REVERSING else 1.0
         rate = (recent(window, window.gyro, RATE_S) - update.bias.gyroscope()) @ self.body_R_vehicle
         data = np.array([sign * speed, sign * slope, *rate, sigma * pass_state.scale(self.name)])
         prior = np.array([self.config.scale_sigma, self.config.delay_sigma])
         wheel = update.use(SessionState("W", self.name, "wheel_scale_and_delay_s", np.zeros(2), prior))
         keys = (key("X", update.index), key("V", update.index), update.use(mount_state(self.vehicle)), wheel)
         update.blocks.append(FactorBatch(self.name, self.model, [keys], data[None], update.t_ns, loss=self.config.loss))
+
+    def _unsigned(self, t_ns: int) -> bool:
+        """Whether no reading that counts at a time is negative, as of a sensor that cannot tell backwards."""
+        first = self._first_negative_ns
+        return first is None or (self.causal and first > t_ns + round(HALF_LINE_S * NS))
 
     def _line(self, t_ns: int) -> tuple[float, float, float] | None:
         """Speed, slope and the sigma of the speed at one time; None where too few readings surround it."""
@@ -159,4 +167,5 @@ def build(context: FactorContext) -> WheelBuilder | None:
         return None
     noise = VEHICLE_CLASSES.get(context.vehicle, VEHICLE_CLASSES["car"])
     axes = frames.body_R_vehicle(device.forward, device.up)
-    return WheelBuilder(stream, axes, noise.wheel_sigma, context.options(WheelConfig), context.options(VehicleConfig))
+    config, vehicle = context.options(WheelConfig), context.options(VehicleConfig)
+    return WheelBuilder(stream, axes, noise.wheel_sigma, config, vehicle, context.causal)

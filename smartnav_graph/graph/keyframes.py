@@ -49,11 +49,14 @@ def keyframe_times(
     gaps: Sequence[Gap],
     config: KeyframeConfig,
     standstills: Times = NOWHERE,
+    *,
+    causal: bool = False,
 ) -> Times:
     """Strictly increasing keyframe stamps (n,) from span_ns[0] to span_ns[1].
 
     Aiding epochs win over everything they stand closer to than `merge_s`.
-    `standstills` are the stamps that standstills ask for: their borders, and what lies between.
+    `standstills` are the stamps that standstills ask for: their borders, and what lies between. `causal` : where a
+    stamp stands does not depend on when the next measurement comes.
     """
     start, end = span_ns
     merge = int(config.merge_s * NS)
@@ -68,19 +71,21 @@ def keyframe_times(
         near = np.minimum(np.abs(rest - aided[right]), np.abs(rest - aided[np.minimum(right + 1, len(aided) - 1)]))
         rest = rest[near > merge]
     fixed = np.union1d(aided, rest)
-    return np.union1d(fixed, _fill(fixed, gaps, config.max_spacing_s))
+    return np.union1d(fixed, _fill(fixed, gaps, config.max_spacing_s, causal=causal))
 
 
-def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float) -> Times:
-    """Evenly spaced stamps between those of `fixed` that stand too far apart."""
+def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float, *, causal: bool) -> Times:
+    """Evenly spaced stamps between those of `fixed` that stand too far apart; `causal` : outside gaps, `spacing_s`
+    after each other until the next comes."""
     length = np.diff(fixed)
     spacing = np.full(length.shape, spacing_s)
     for gap in gaps:
         spacing[inside([gap], fixed[:-1] + length // 2)] = max(GAP_SPACING_S, GAP_SHARE * gap.length_s)
     parts = np.maximum(np.ceil(length / NS / spacing - 1e-9).astype(np.int64), 1)
+    apart = np.where(causal & (spacing == spacing_s), spacing_s, length / NS / parts)
     pieces = [
-        ns_from_seconds(np.arange(1, n) * (step / NS / n)) + begin
-        for begin, step, n in zip(fixed[:-1], length, parts, strict=True)
+        ns_from_seconds(np.arange(1, n) * step) + begin
+        for begin, step, n in zip(fixed[:-1], apart, parts, strict=True)
         if n > 1
     ]
     return np.concatenate([np.zeros(0, np.int64), *pieces])

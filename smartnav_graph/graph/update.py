@@ -165,12 +165,14 @@ class Builder:
 
     name : of its factors; stage : of the passes that it takes part in first (see `PassState`)
     lookahead_s : how far beyond the end of a window it reads; note : a warning for the run, empty for none
+    causal : it decides by what is known at the end of a window where a batch run decides by the whole recording
     """
 
     name: str
     stage: int = 0
     lookahead_s: float = 0.0
     note: str = ""
+    causal: bool = False
 
     def begin(self) -> Builder:
         """The builder of one pass. One that accumulates over windows gives a copy that has seen none: what a pass finds

@@ -122,12 +122,14 @@ class Standstills:
         part = values[i : j + 1]
         return float(part.max()) if len(part) else np.nan
 
-    def keyframes(self, inner_s: float | None = None) -> Times:
-        """Borders of all standstills, and stamps at most `inner_s` apart inside them."""
+    def keyframes(self, inner_s: float | None = None, *, causal: bool = False) -> Times:
+        """Borders of all standstills, and stamps at most `inner_s` apart inside them: evenly, or `inner_s` after each
+        other where it is not known yet when one ends (`causal`)."""
         stamps = [np.zeros(0, dtype=np.int64)]
         for start, end in self.spans():
             parts = 1 if inner_s is None else max(1, int(np.ceil((end - start) / NS / inner_s - 1e-9)))
-            stamps.append(start + np.rint(np.arange(parts + 1) / parts * (end - start)).astype(np.int64))
+            apart = inner_s * NS if causal and inner_s is not None else (end - start) / parts
+            stamps += [start + np.rint(np.arange(parts) * apart).astype(np.int64), np.array([end])]
         return np.unique(np.concatenate(stamps))
 
 
@@ -140,6 +142,7 @@ def find_standstills(
     gravity: float,
     config: StandstillConfig,
     seen: StaticPeriod | None = None,
+    known_ns: int | None = None,
 ) -> Standstills:
     """The standstills of a recording.
 
@@ -151,11 +154,13 @@ def find_standstills(
     vehicle : none, car, trolley or foot: only on foot, or where nothing is known, can the device be foot-mounted
     noise : of the sensor, densities; gravity m/s^2
     seen : periods in which a camera stood still
+    known_ns : end of the data that show whether the device is mounted on a foot; all of them by default
     """
     found = Standstills.none(imu.t_ns)
     if config.detect and len(imu) > 2:
         blocks = Blocks.cut(imu, gaps, gravity)
-        on_foot = config.mounting == "foot" or (config.mounting == "auto" and is_foot_mounted(blocks, vehicle))
+        known = blocks if known_ns is None else Blocks.cut(imu.take(imu.t_ns <= known_ns), gaps, gravity)
+        on_foot = config.mounting == "foot" or (config.mounting == "auto" and is_foot_mounted(known, vehicle))
         found = _rests(blocks, imu.t_ns, noise, gravity, on_foot)
         if config.standing and vehicle == "foot" and not on_foot:
             found = replace(found, speed_sigma=np.fmin(found.speed_sigma, _hand_speed(blocks)))

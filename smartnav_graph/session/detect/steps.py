@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import firwin
 
-from smartnav_graph.core.arrays import Floats, Indices, Times, runs
+from smartnav_graph.core.arrays import Floats, Indices, Times
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session.streams import Imu
@@ -63,6 +63,23 @@ class Steps:
         zero = int(knots[0])  # nanoseconds since 1970 would lose their last digits as floats
         return np.asarray(np.interp((t_ns - zero) / NS, (knots - zero) / NS, values))
 
+    @cached_property
+    def regular_seconds(self) -> Floats:
+        """Seconds (n,) up to the end of each step that were spent in runs of at least `RUN` steps whose periods hardly
+        differ: nearly all of them for a device in the hand of a pedestrian, hardly any in a vehicle or on a foot."""
+        period = np.diff(self.end_ns) / NS
+        usual = period <= LONGEST_PERIOD_S
+        alike = np.abs(np.diff(np.log(period))) < np.log(1.0 + RATIO)
+        joined = np.concatenate([[False], usual[1:] & usual[:-1] & alike])
+        found, before, count, length = [0.0], 0.0, 0, 0.0  # earlier runs; steps and seconds of the present one
+        for seconds, goes_on in zip(period.tolist(), joined.tolist(), strict=False):
+            if not goes_on:
+                before += length if count >= RUN else 0.0
+                count, length = 1, 0.0
+            count, length = count + 1, length + seconds
+            found.append(before + (length if count >= RUN else 0.0))
+        return np.array(found[: len(self)])
+
 
 def find_steps(imu: Imu) -> Steps:
     """The steps of a recording."""
@@ -100,14 +117,3 @@ def _rises(force: Floats) -> Indices:
             if not found or k - found[-1] >= SHORTEST_S * RATE_HZ:
                 found.append(k)
     return np.array(found, dtype=np.intp)
-
-
-def regular_share(steps: Steps, length_s: float) -> float:
-    """Share of `length_s` seconds spent in runs of at least `RUN` steps of similar periods: near one for a
-    device in the hand of a pedestrian, near zero in a vehicle or on a foot."""
-    period = np.diff(steps.end_ns) / NS
-    usual = period <= LONGEST_PERIOD_S
-    similar = np.abs(np.diff(np.log(period))) < np.log(1.0 + RATIO) if len(period) else np.zeros(0, dtype=bool)
-    regular = runs(usual[1:] & usual[:-1] & similar)
-    total = sum(period[i : j + 1].sum() for i, j in regular if j - i + 2 >= RUN)
-    return float(total / length_s)

@@ -5,7 +5,7 @@ import pytest
 
 from smartnav_graph import readers, simulation
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.session.detect.steps import LOOKAHEAD_S, Steps, find_steps, regular_share
+from smartnav_graph.session.detect.steps import LOOKAHEAD_S, Steps, find_steps
 from smartnav_graph.session.streams import Imu
 from smartnav_graph.simulation import motions, scenarios
 
@@ -70,24 +70,27 @@ def test_a_simulated_walk_steps_at_its_cadence_and_rests_where_it_rests():
     assert 1 / np.median(np.diff(steps.end_ns) / NS) == pytest.approx(1.9, abs=0.04)
 
 
+def regular_share(imu: Imu) -> float:
+    """Share of a recording spent walking."""
+    seconds = find_steps(imu).regular_seconds
+    return float(seconds[-1] / (imu.t_ns[-1] - imu.t_ns[0]) * NS) if len(seconds) else 0.0
+
+
 @pytest.mark.parametrize(("scenario", "least", "most"), [("walk-60s", 0.7, 1.0), ("phone-car-5min", 0.0, 0.02)])
 def test_a_walk_is_reported_from_a_ride(scenario, least, most):
     session = simulation.scenarios.simulate(scenario)
-    share = regular_share(find_steps(session.imu), float(session.seconds(session.imu.t_ns[-1])))
+    share = regular_share(session.imu)
     assert least <= share <= most
 
 
 def test_no_walk_in_nothing():
     nothing = Steps(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    assert regular_share(nothing, 10.0) == 0.0
-    assert regular_share(find_steps(bobbing(1.9, 2.0, seconds=1.2)), 1.2) == 0.0
+    assert not len(nothing.regular_seconds)
+    assert regular_share(bobbing(1.9, 2.0, seconds=1.2)) == 0.0
 
 
 def test_the_public_recordings(dataset, kitti):
-    def share(imu: Imu) -> float:
-        return regular_share(find_steps(imu), float(imu.t_ns[-1] - imu.t_ns[0]) / NS)
-
     walks = [readers.read(file).imu for file in sorted(dataset("indoor_waypoints_ms").glob("site1/*/*.txt"))]
     assert [len(find_steps(imu)) for imu in walks] == pytest.approx([122, 139], abs=5)
-    assert min(share(imu) for imu in walks) > 0.7
-    assert share(kitti.imu) < 0.1 and share(readers.read(dataset("car_comma2k19")).imu) < 0.1
+    assert min(regular_share(imu) for imu in walks) > 0.7
+    assert regular_share(kitti.imu) < 0.1 and regular_share(readers.read(dataset("car_comma2k19")).imu) < 0.1
