@@ -125,7 +125,8 @@ def session_windows(context: FactorContext, span: tuple[int, int]) -> tuple[list
 
 def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
     """The problem of a replay for a batch solution: every row at its measurement time, keyframes, gaps and builders by
-    all that was recorded. Only rows known by `available_ns` where that is given; the problem itself where there is no difference."""
+    all that was recorded. Only rows known by `available_ns` where that is given; the problem itself where there is no
+    difference."""
     context = FactorContext(
         *(problem.session, problem.calibration, problem.gaps, problem.vehicle, problem.config, problem.rests),
         pairs=problem.pairs,

@@ -12,7 +12,7 @@ from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import Clock, run_pass, solve_passes
-from smartnav_graph.estimate.problem import LONGEST_INITIALISATION_S, TOO_LATE, Problem, batch_problem, prepare
+from smartnav_graph.estimate.problem import TOO_LATE, Problem, batch_problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     carried_over,
     causal_solution,
@@ -21,7 +21,7 @@ from smartnav_graph.estimate.result.diagnostics import UpdateLog
 from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.run import Run, _finish, initialise
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
+from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
@@ -43,7 +43,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     problem = prepare(session, config or Config(), causal=True)
     clock.lap("prepare")
     progress("finding the start", 0, 0)
-    initial = initialise(problem, longest_s=LONGEST_INITIALISATION_S)
+    initial = initialise(problem, longest_s=INITIALISATION_S)
     clock.lap("initialise")
     smoother = incremental(problem.config.replay, problem.session.t0_ns)
     builders, log = [initial.prior.with_position(), *problem.builders], UpdateLog(smoother)

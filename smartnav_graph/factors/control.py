@@ -40,4 +40,4 @@ def build(context: FactorContext) -> PositionBuilder | None:
         lever_arm_sigma=options.lever_arm_sigma,
     )
     noise = GnssNoise(options.default_sigma, options.default_sigma)
-    return PositionBuilder.of(context.session, "control", stream, noise, config)
+    return PositionBuilder.of(context, "control", stream, noise, config)

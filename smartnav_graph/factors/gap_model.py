@@ -34,6 +34,7 @@ from scipy.optimize import nnls
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS, Gap, seconds_since
+from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session.calibration.model import ImuNoise
 from smartnav_graph.session.streams import Imu
 
@@ -113,7 +114,6 @@ class Recorded:
 Feature = tuple[int, float, float]
 FEATURES: tuple[Feature, ...] = tuple((side, a, b) for side in (-1, 1) for a, b in ((0.0, 0.0), *MOMENTS))
 REACH = MOMENTS[-1][1]
-START_S = 30.0  # what a replay may look at before it begins
 
 
 def _seen(recorded: Recorded, start: Floats, end: Floats, features: Sequence[Feature]) -> Floats:
@@ -247,7 +247,7 @@ def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
 
 def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> dict[int, Bridge]:
     """The best bridge of every gap, by its start stamp. Where no honest stretch is as long as a gap, shorter ones stand
-    in. `causal` : each is learnt from what was recorded by `REACH` after it, or in the first `START_S`."""
+    in. `causal` : each is learnt from what was recorded by `REACH` after it, or in the first `INITIALISATION_S`."""
     if not gaps:
         return {}
     if not causal:
@@ -255,7 +255,7 @@ def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = Fa
         return {gap.start_ns: _bridge(recorded, gap, imu, floor) for gap in gaps}
     found = {}
     for gap in gaps:
-        now = max(gap.end_ns + round(REACH * NS), int(imu.t_ns[0]) + round(START_S * NS))
+        now = max(gap.end_ns + round(REACH * NS), int(imu.t_ns[0]) + round(INITIALISATION_S * NS))
         known = imu.take(imu.t_ns <= now)
         recorded = Recorded(known, [other for other in gaps if other.end_ns <= known.t_ns[-1]])
         found[gap.start_ns] = _bridge(recorded, gap, known, floor)

@@ -19,16 +19,16 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gauss_markov import add_wander, wander_sigma
 from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
+from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate, RowModel
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
-from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 
 LEAST_WANDERING_SIGMA = 0.5  # m
@@ -117,8 +117,8 @@ class PositionBuilder(Builder):
     """Adds one position factor a fix.
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
-    came with the data and is never scaled. Rows are judged by `least_gate_sigma` m at least when outliers are looked
-    for.
+    came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
+    first. Rows are tested with `least_gate_sigma` m at least when outliers are looked for.
     """
 
     name: str
@@ -130,6 +130,7 @@ class PositionBuilder(Builder):
     noise: GnssNoise = field(default_factory=GnssNoise)
     gravity: float = STANDARD_GRAVITY
     least_gate_sigma: float = 0.0
+    typical: NDArray[np.bool_] | slice = field(default_factory=lambda: slice(None))
     stage: int = 0
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
@@ -142,19 +143,24 @@ class PositionBuilder(Builder):
 
     @classmethod
     def of(
-        cls, session: Session, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig
+        cls, context: FactorContext, name: str, stream: Positioned, noise: GnssNoise, config: GnssConfig
     ) -> PositionBuilder:
         """Builder of a session's stream of positions."""
+        session = context.session
         given = np.full((len(stream), 3), np.nan) if stream.sigma is None else stream.sigma
         own = np.asarray(np.isfinite(given).all(axis=1))
         lever = session.lever_arms(stream)
         position, sigma = session.nav_position(stream), fix_sigmas(stream, noise)
-        return cls(name, position, sigma, own, lever, config, noise, session.gravity)
+        typical = np.ones(len(stream), dtype=bool)
+        if context.causal:
+            first = max(session.t0_ns + round(INITIALISATION_S * NS), int(stream.available_ns.min()))
+            typical = stream.available_ns <= first
+        return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical)
 
     def wanders(self, pass_state: PassState) -> bool:
         """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
         `LEAST_WANDERING_SIGMA`. Better ones come from carrier phase, whose errors do not wander by metres."""
-        typical = float(np.median(self.scaled_sigma(pass_state)[:, :2]))
+        typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
         return self.noise.is_correlated and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
@@ -290,6 +296,4 @@ def build(context: FactorContext) -> PositionBuilder | None:
     stream = context.session.gnss
     if stream is None:
         return None
-    return PositionBuilder.of(
-        context.session, "gnss", stream, context.calibration.gnss_noise, context.options(GnssConfig)
-    )
+    return PositionBuilder.of(context, "gnss", stream, context.calibration.gnss_noise, context.options(GnssConfig))

@@ -205,7 +205,7 @@ def build(context: FactorContext) -> PoseFixBuilder | None:
         lever_arm_sigma=0.0 if stated else config.lever_arm_sigma,
     )
     sigma = context.calibration.pose_fix_noise.position_sigma
-    builder = PoseFixBuilder.of(context.session, NAME, stream, GnssNoise(sigma, sigma), options)
+    builder = PoseFixBuilder.of(context, NAME, stream, GnssNoise(sigma, sigma), options)
     assert isinstance(builder, PoseFixBuilder)
     return replace(builder, least_gate_sigma=LEAST_GATE_SIGMA)
 

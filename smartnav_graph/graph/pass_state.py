@@ -30,6 +30,8 @@ class Phase(Enum):
 # Stage 0 has what finds the trajectory (fixes, standstills), stage 1 also what needs it found first (vehicle
 # constraints, time offsets, magnetometer, steps).
 LAST_STAGE = 1
+# What a replay may look at before its first output, s.
+INITIALISATION_S = 30.0
 
 
 @dataclass(frozen=True)

@@ -171,21 +171,3 @@ def test_gross_outliers_do_not_turn_a_replay_over():
     causal = sn.replay(with_gnss(session, lla=lla), configured("fixed-lag"))
     off = causal.nav_t_body - positions(session, causal.t_ns)
     assert np.linalg.norm(off[31:, :2], axis=1).max() < 5.0  # m
-
-
-@pytest.mark.parametrize("scenario", ["walk-all-2min", pytest.param("car-all-2min", marks=pytest.mark.slow)])
-def test_no_sensor_looks_further_ahead_than_a_second(scenario):
-    """All streams cut off at 36 s and at 45 s: up to a second before the first cut every state is the same bits."""
-    session, config = sn.simulate(scenario), configured("fixed-lag", polish=False)
-    one, other = (sn.run(until(session, seconds), config, causal=True).causal for seconds in (36.0, 45.0))
-    known = one.seconds <= 35.0
-    assert known.sum() > 35 and np.array_equal(one.t_ns[known], other.t_ns[: known.sum()])
-    for name in ("nav_t_body", "nav_R_body", "nav_v_body", "accel_bias", "gyro_bias", "covariance"):
-        assert np.array_equal(getattr(one, name)[known], getattr(other, name)[: known.sum()]), name
-
-
-def until(session: sn.Session, seconds: float) -> sn.Session:
-    """The recording as if it had been stopped."""
-    end = session.t0_ns + round(seconds * NS)
-    cut = {name: stream.take(stream.t_ns <= end) for name, stream in session.streams().items()}
-    return session.replace(**{name: stream if len(stream) else None for name, stream in cut.items()})

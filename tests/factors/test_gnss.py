@@ -13,12 +13,14 @@ from scipy.stats import chi2
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, fix_sigmas, noise_model
 from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.calibration.model import Calibration, GnssNoise
 from smartnav_graph.session.streams import GnssFix
 
 
@@ -70,7 +72,8 @@ def test_geodetic_fixes_arrive_in_local_metres():
     session = record().session.replace(
         origin=origin, gnss=GnssFix(t_ns=[0, 1], lla=LocalFrame(origin).lla_from_nav(enu)), control=None
     )
-    made = PositionBuilder.of(session, "gnss", session.gnss, GnssNoise(), GnssConfig())
+    context = FactorContext(session, Calibration(), (), "none", Config())
+    made = PositionBuilder.of(context, "gnss", session.gnss, GnssNoise(), GnssConfig())
     np.testing.assert_allclose(made.position, enu, atol=1e-6)
     np.testing.assert_array_equal(made.lever, np.tile(LEVER, (len(made.lever), 1)))
     assert not made.own_sigma.any()

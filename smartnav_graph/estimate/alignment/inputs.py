@@ -37,7 +37,7 @@ def first_stretch(problem: Problem, longest_s: float | None = None) -> FirstStre
         windows=problem.windows,
         imu=session.require_imu(),
         fixes=fixes if causal else replace(fixes, available_ns=fixes.t_ns),
-        fix_sigma=max((float(np.median(b.sigma)) for b in position_builders(problem.builders)), default=1.0),
+        fix_sigma=max((float(np.median(b.sigma[b.typical])) for b in position_builders(problem.builders)), default=1.0),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
@@ -64,15 +64,17 @@ def _standing(problem: Problem, shortest_s: float) -> int | None:
 def _walked(problem: Problem, fixes: Fixes, causal_s: float | None) -> Walk | None:
     """The rough path of a pedestrian, where fixes are far apart; by what is known after `causal_s` seconds."""
     steps = one_of(problem.builders, StepBuilder)
-    if steps is None or len(fixes) < 2 or float(np.median(np.diff(fixes.t_ns))) < SPARSE_S * NS:
-        return None
     end = problem.windows[-1].t1_ns if causal_s is None else problem.windows[0].t1_ns + int(causal_s * NS)
     used, noise = fixes.available_ns <= end, problem.calibration
+    if steps is None or not steps.walks(end) or used.sum() < 2:
+        return None
+    if float(np.median(np.diff(fixes.t_ns[used]))) < SPARSE_S * NS:
+        return None
     return walked(
         [window for window in problem.windows if window.t1_ns <= end],
         steps.steps,
         (fixes.t_ns[used], fixes.position[used]),
-        max((float(np.median(b.sigma[:, :2])) for b in position_builders(problem.builders)), default=1.0),
+        max((float(np.median(b.sigma[b.typical, :2])) for b in position_builders(problem.builders)), default=1.0),
         noise.imu_noise.gyro_bias_sigma,
         steps.model.body_R_vehicle,
         noise.step_noise,

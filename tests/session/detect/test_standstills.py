@@ -280,3 +280,22 @@ def test_too_short_and_odd_recordings():
     assert found(ride(motions.static(60.0), hertz=10.0)).still.all()
     upside = replace(samples := ride(motions.static(10.0)), accel=1.2 * samples.accel)
     assert not found(upside).still.any()  # 20 % more than gravity is no rest
+
+
+def test_a_replay_decides_by_the_first_seconds_whether_a_device_is_on_a_foot():
+    samples, _ = foot()
+    noise, options = PHONE, StandstillConfig()
+    at = {
+        known_s: find_standstills(
+            samples, None, (), "none", noise, GRAVITY, options, known_ns=round(known_s * NS)
+        ).on_foot
+        for known_s in (3.0, 20.0)
+    }
+    assert at == {3.0: False, 20.0: True}
+
+
+def test_stamps_inside_a_standstill_do_not_wait_for_its_end():
+    t_ns = np.arange(101) * NS // 10
+    rests = [Standstills(t_ns[:n], np.zeros(n), np.zeros(n)) for n in (48, 101)]
+    early, late = (rest.keyframes(0.9, causal=True) / NS for rest in rests)
+    assert early[:-1].tolist() == late[: len(early) - 1].tolist() == pytest.approx([0, 0.9, 1.8, 2.7, 3.6, 4.5])
