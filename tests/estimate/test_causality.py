@@ -55,10 +55,8 @@ def _wheel_that_counts_backwards_later() -> sn.Session:
     session = sn.simulate("car-all-2min")
     wheel = session.wheel
     later = wheel.t_ns > session.t0_ns + 60 * NS
-    return session.replace(
-        device=replace(session.device, forward="-y"),
-        wheel=replace(wheel, speed=np.where(later, -1.0, 1.0) * wheel.speed),
-    )
+    speed = np.where(later, -1.0, 1.0) * np.abs(wheel.speed)
+    return session.replace(device=replace(session.device, forward="-y"), wheel=replace(wheel, speed=speed))
 
 
 def _walk_that_is_short() -> sn.Session:
