@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.evaluation.consistency import chi2_bounds
-from smartnav_graph.smoothers.estimate import Estimate, distance
+from smartnav_graph.smoothers.estimate import Estimate, state_distance
 
 
 def largest_difference(one: Estimate, other: Estimate) -> tuple[float, float]:
     """Largest distance m and rotation angle deg over the keyframes of two estimates of the same problem."""
-    return distance(one.states(), other.states())
+    return state_distance(one.states(), other.states())
 
 
 def wrap_deg(angle: ArrayLike) -> Floats:

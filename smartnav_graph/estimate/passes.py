@@ -166,7 +166,7 @@ def solve_passes(
     coarse_start: bool = False,
     first_s: float = 0.0,
     progress: Progress = silent,
-    clock: Clock | None = None,
+    clock: StageTimes | None = None,
 ) -> tuple[Estimate, PassState, int]:
     """Batch passes until nothing changes.
 
@@ -247,7 +247,7 @@ def _preintegration_s(problem: Problem) -> float:
     return 0.0 if imu is None else imu.cache.seconds
 
 
-class Clock:
+class StageTimes:
     """Wall seconds by stage."""
 
     def __init__(self) -> None:

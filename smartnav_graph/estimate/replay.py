@@ -11,7 +11,7 @@ import numpy as np
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.passes import Clock, run_pass, solve_passes
+from smartnav_graph.estimate.passes import StageTimes, run_pass, solve_passes
 from smartnav_graph.estimate.problem import TOO_LATE, Problem, batch_problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     carried_over,
@@ -24,7 +24,7 @@ from smartnav_graph.estimate.run import Run, _finish, initialise
 from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers import incremental
-from smartnav_graph.smoothers.estimate import Estimate, distance, states_of
+from smartnav_graph.smoothers.estimate import Estimate, state_distance, states_of
 
 # A polish that moves a state further than this starts again from what it found.
 FAR_M, FAR_DEG = 0.1, 1.0
@@ -38,7 +38,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     SessionError, ConfigError, SolverError
         As `smooth`.
     """
-    clock = Clock()
+    clock = StageTimes()
     progress("preparing", 0, 0)
     problem = prepare(session, config or Config(), causal=True)
     clock.lap("prepare")
@@ -103,7 +103,7 @@ def _polished(
         found, pass_state, passes = solve_passes(
             whole, whole.windows, initial.prior, pass_state, initial_values=initial_values, progress=progress
         )
-        metres, degrees = distance(states_of(initial_values, found.indices), found.states())
+        metres, degrees = state_distance(states_of(initial_values, found.indices), found.states())
         moved = moved or {"largest_change_m": metres, "largest_change_deg": degrees}
         total += passes
         if (metres < FAR_M and degrees < FAR_DEG) or total >= whole.config.run.passes:

@@ -14,7 +14,7 @@ from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.alignment.initialiser import find_initial_state
 from smartnav_graph.estimate.alignment.inputs import first_stretch
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.passes import Clock, causal_start, solve_passes
+from smartnav_graph.estimate.passes import StageTimes, causal_start, solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
 from smartnav_graph.estimate.result.assemble import (
     Withheld,
@@ -75,7 +75,7 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     SessionError, ConfigError, SolverError
         Bad input, or a problem that cannot be solved; the message says what to do.
     """
-    clock = Clock()
+    clock = StageTimes()
     progress("preparing", 0, 0)
     problem = prepare(session, config or Config())
     clock.lap("prepare")
@@ -103,7 +103,7 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
 def _finish(
     solved: SolvedProblem,
     initial: InitialState,
-    clock: Clock,
+    clock: StageTimes,
     extra: Mapping[str, Any],
     causal: Solution | None = None,
     updates: Updates | None = None,

@@ -87,7 +87,7 @@ class PositionFix:
 
 
 @cache
-def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
+def position_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
     """The one row model of each kind of fix; where : as in `observation.row_model`."""
     return row_model(PositionFix(extra), timed=timed, where=where)
 
@@ -271,7 +271,7 @@ class PositionBuilder(Builder):
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = model_of(extra, "T" in states, where)
+        model = position_model(extra, "T" in states, where)
         keys = update.keys(model.letters, index, states)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

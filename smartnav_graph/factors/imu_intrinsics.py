@@ -32,7 +32,7 @@ def scale_state(sigma: float) -> SessionState:
     return SessionState("S", "imu", NAME, np.zeros(18), np.full(18, sigma))
 
 
-def integrated(window: Window, bias: Floats) -> Integrated:
+def integrated_with_intrinsics(window: Window, bias: Floats) -> Integrated:
     """Preintegrate at a bias (6,) and S = 0, with derivatives by bias and S (24)."""
     force, rate = window.accel - bias[:3], window.gyro - bias[3:]
     force_by, rate_by = np.zeros((2, len(window.dt), 3, 24))
@@ -48,7 +48,7 @@ def _by_elements(reading: Floats) -> Floats:
 
 def columns(window: Window, bias: Floats, covariance: Floats, gravity: float) -> Floats:
     """Data of one row; covariance (9, 9) of GTSAM's preintegrated [rotation vector, position, velocity]."""
-    return MODEL.data(window, integrated(window, bias), bias, covariance, gravity)
+    return MODEL.data(window, integrated_with_intrinsics(window, bias), bias, covariance, gravity)
 
 
 def add(update: GraphUpdate, window: Window, bias: Any, covariance: Floats, gravity: float, sigma: float) -> None:

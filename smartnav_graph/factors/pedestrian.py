@@ -93,7 +93,7 @@ class Stride:
 
 
 @cache
-def model_of(forward: str, up: str) -> Stride:
+def stride_model(forward: str, up: str) -> Stride:
     """The one row model of a device's axes."""
     return Stride(frames.body_R_vehicle(forward, up))
 
@@ -189,7 +189,7 @@ def build(context: FactorContext) -> StepBuilder | None:
     if not (declared or share.max(initial=0.0) >= WALK):
         return None
     note = "" if declared else _note(len(steps), float(share[-1]))
-    model = model_of(session.device.forward, session.device.up)
+    model = stride_model(session.device.forward, session.device.up)
     noise = context.calibration.step_noise
     causal = context.causal and not declared
     return StepBuilder(steps, _good_fixes(context), model, noise, config, note, session.t0_ns, causal)

@@ -94,7 +94,7 @@ class AttitudeFix:
 
 
 @cache
-def model_of(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
+def attitude_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
     """The one row model of each kind of row; where : as in `observation.row_model`."""
     return row_model(AttitudeFix(extra), timed=timed, where=where)
 
@@ -180,7 +180,7 @@ class AttitudeBuilder(Builder):
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         used = not (pass_state.is_rejected(self.name, row) or pass_state.is_rejected(NAME, row))
-        model = model_of(("A",) * ("A" in states), "T" in states, where)
+        model = attitude_model(("A",) * ("A" in states), "T" in states, where)
         keys, loss = update.keys(model.letters, index, states), self._loss(pass_state)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

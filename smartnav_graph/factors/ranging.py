@@ -73,7 +73,7 @@ class AnchorRange:
 
 
 @cache
-def model_of(extra: tuple[str, ...], where: str) -> RowModel:
+def range_model(extra: tuple[str, ...], where: str) -> RowModel:
     """The one row model of each kind of range; where : as in `observation.row_model`."""
     return row_model(AnchorRange(extra), where=where)
 
@@ -157,7 +157,7 @@ class RangeBuilder(Builder):
         data = np.concatenate([self.anchor[row], self.lever, [self.distance[row], self.sigma[row]]])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = model_of(tuple(states), "keyframe" if partial is None else "instant")
+        model = range_model(tuple(states), "keyframe" if partial is None else "instant")
         keys, used = update.keys(model.letters, index, states), not pass_state.is_rejected(self.name, row)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

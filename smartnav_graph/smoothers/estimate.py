@@ -154,7 +154,7 @@ def values_of(indices: Sequence[int], R: Floats, p: Floats, v: Floats, bias: Flo
     return values
 
 
-def distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, float]:
+def state_distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[float, float]:
     """Largest distance m and rotation angle deg between keyframe states (see `Estimate.states`)."""
     Ra, pa, Rb, pb = *one[:2], *other[:2]
     trace = np.einsum("nij,nij->n", Ra, Rb)

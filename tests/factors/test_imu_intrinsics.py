@@ -58,7 +58,7 @@ BIAS = np.array([0.1, -0.2, 0.05, 0.01, -0.02, 0.03])
 
 
 def test_integration_is_that_of_the_mechanisation_and_nearly_gtsams():
-    found = imu_intrinsics.integrated(tumbling(), BIAS)
+    found = imu_intrinsics.integrated_with_intrinsics(tumbling(), BIAS)
     R, rest = deltas(tumbling(), BIAS, np.zeros(18))
     np.testing.assert_allclose(found.dR, R, atol=1e-12)
     np.testing.assert_allclose(np.concatenate([found.dp, found.dv]), rest, atol=1e-12)
@@ -72,7 +72,7 @@ def test_integration_is_that_of_the_mechanisation_and_nearly_gtsams():
 
 def test_derivatives_by_bias_scale_and_misalignment_are_the_numerical_ones():
     window, step = tumbling(), 1e-5
-    found = imu_intrinsics.integrated(window, BIAS)
+    found = imu_intrinsics.integrated_with_intrinsics(window, BIAS)
     for column in range(24):
         ends = []
         for sign in (1.0, -1.0):

@@ -17,7 +17,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import pedestrian as step_factor
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.pedestrian import StepBuilder, StepConfig, Stride, level_yaw, model_of
+from smartnav_graph.factors.pedestrian import StepBuilder, StepConfig, Stride, level_yaw, stride_model
 from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.update import GraphUpdate
@@ -92,7 +92,7 @@ def builder(**changes) -> StepBuilder:
     values = {
         "steps": Steps(second - NS // 2, second, np.full(30, 16.0)),  # two units a step, walked in half a second
         "fixes_ns": np.zeros(0, np.int64),
-        "model": model_of("+y", "+z"),
+        "model": stride_model("+y", "+z"),
         "noise": StepNoise(),
     }
     return StepBuilder(**{**values, **changes})

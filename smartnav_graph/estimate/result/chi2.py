@@ -67,7 +67,7 @@ def _enough(part: SensorFit) -> bool:
     return part.redundancy >= LEAST_REDUNDANCY
 
 
-def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.Account | None) -> Chi2:
+def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.TrackAccount | None) -> Chi2:
     """Of a solved problem and the residuals of its keyframes."""
     parts: dict[str, SensorFit] = {}
     for name, found in redundancies(solved.estimate).items():

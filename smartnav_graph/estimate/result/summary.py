@@ -19,7 +19,7 @@ from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
 from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight import track_outliers
-from smartnav_graph.estimate.reweight.image_pair_outliers import Account, account
+from smartnav_graph.estimate.reweight.image_pair_outliers import PairAccount, pair_account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.update import OBSERVED
@@ -81,7 +81,10 @@ def summarise(
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
     absolute = bool(used_counts(problem, pass_state))
-    seen, tracks = account(problem.builders, pass_state), track_outliers.account(problem.builders, pass_state)
+    seen, tracks = (
+        pair_account(problem.builders, pass_state),
+        track_outliers.track_account(problem.builders, pass_state),
+    )
     fit = chi2_of(solved, keyframes, tracks)
     chi2 = fit.per_dof()
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
@@ -150,7 +153,9 @@ def _gaps(problem: Problem) -> list[dict[str, Any]]:
     ]
 
 
-def _rejected(pass_state: PassState, seen: Account | None, tracks: track_outliers.Account | None) -> dict[str, int]:
+def _rejected(
+    pass_state: PassState, seen: PairAccount | None, tracks: track_outliers.TrackAccount | None
+) -> dict[str, int]:
     """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the trajectory, and matches and
     observations of those that do not."""
     found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("image_pairs", "matches")}

@@ -116,7 +116,7 @@ def _by_states(
 
 
 @dataclass(frozen=True)
-class Account:
+class PairAccount:
     """What became of the pairs (by reason, `REASONS`) and of the matches of those in use."""
 
     pairs: Mapping[str, int]
@@ -130,7 +130,7 @@ class Account:
         return self.matches - self.outliers - POSE_DOF * self.pairs[REASONS[IN_USE]]
 
 
-def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
+def pair_account(builders: Iterable[Builder], pass_state: PassState) -> PairAccount | None:
     """The account of the image pairs of a run; None where there are none, or tracks replace them."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or builder.replaced(pass_state):
@@ -141,7 +141,7 @@ def account(builders: Iterable[Builder], pass_state: PassState) -> Account | Non
     inside = verdict[builder.seen.pair] == IN_USE
     use = builder.used_matches(pass_state)
     by_reason = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    return Account(by_reason, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
+    return PairAccount(by_reason, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
 
 
 def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estimate: Estimate) -> tuple[Relative, Mask]:

@@ -166,7 +166,7 @@ def whitened(
 
 
 @dataclass(frozen=True)
-class Account:
+class TrackAccount:
     """What became of the tracks (by reason, `REASONS`) and of the observations of those in use."""
 
     tracks: Mapping[str, int]
@@ -191,7 +191,7 @@ class Account:
         return 2 * (self.observations - self.outliers) - POINT_DOF * self.points
 
 
-def account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
+def track_account(builders: Iterable[Builder], pass_state: PassState) -> TrackAccount | None:
     """The account of the tracks of a run; None where they are not asked for."""
     builder, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
     if builder is None:
@@ -204,4 +204,4 @@ def account(builders: Iterable[Builder], pass_state: PassState) -> Account | Non
     inside = builder.sightings.there & (selection.verdict == IN_USE)[:, None]
     wrong = int((inside & ~selection.use).sum())
     refused = selection.refused or refused
-    return Account(by_reason, int(inside.sum()), wrong, refused, builder.in_force(pass_state))
+    return TrackAccount(by_reason, int(inside.sum()), wrong, refused, builder.in_force(pass_state))

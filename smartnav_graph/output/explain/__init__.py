@@ -16,7 +16,7 @@ from smartnav_graph.evaluation.influence import FACTORS, KEYFRAMES, Influence, i
 from smartnav_graph.graph.solution import POS
 from smartnav_graph.output.explain.figures import Explanation
 from smartnav_graph.output.explain.nearby import Nearby, nearby
-from smartnav_graph.output.explain.sentences import sentences, table
+from smartnav_graph.output.explain.sentences import sentences, variance_table
 from smartnav_graph.output.run_folder import StoredRun
 
 __all__ = ["Explained", "Explanation", "explain"]
@@ -36,7 +36,7 @@ class Explained:
 
     def to_text(self) -> str:
         """The sentences, then tables."""
-        return "\n".join(self.sentences) + "\n" + table(self.figures)
+        return "\n".join(self.sentences) + "\n" + variance_table(self.figures)
 
 
 def explain(run: StoredRun, at_s: float | None = None) -> Explained:

@@ -48,7 +48,7 @@ def sentences(found: Explanation, near: Nearby) -> list[str]:
     return [_epoch(found), _accuracy(found), *determined, *_in_use(near), *_shifted(found), *_surroundings(near)]
 
 
-def table(found: Explanation) -> str:
+def variance_table(found: Explanation) -> str:
     """Variance of each quantity by source, and the shifts at the keyframe by source."""
     names = [SHORT.get(quantity.name, quantity.name) for quantity in QUANTITIES]
     lines = ["", f"{'variance by source':<18}{''.join(f'{name:>10}' for name in names)}"]

@@ -11,13 +11,13 @@ from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report.charts import Intervals, figure, over_time, shaded
 from smartnav_graph.output.report.session_states import CLOCK, parts_of
-from smartnav_graph.output.report.svg import axis, finite, spread_axis
+from smartnav_graph.output.report.svg import axis, finite_values, spread_axis
 from smartnav_graph.output.text import Row, Table, count, metres, number, plural
 
 SMALLEST_M = 1e-4  # smaller changes are drawn as this
 
 
-def table(updates: Updates) -> Table:
+def updates_table(updates: Updates) -> Table:
     """Median, 99 % and largest of each figure of the updates."""
     rows = [
         _row("Computing time", updates.latency_ms, lambda v: f"{number(v)} ms"),
@@ -52,14 +52,16 @@ def draw(updates: Updates, solution: Solution, gaps: Intervals) -> str:
         "<p>Each update adds one keyframe and corrects the keyframes that are still in its window. The change of "
         "earlier states is the largest distance by which one of them moved.</p>"
     )
-    return note + table(updates).html() + figure([change, work, cost], entries) + _clocks(updates, solution, gaps)
+    return (
+        note + updates_table(updates).html() + figure([change, work, cost], entries) + _clocks(updates, solution, gaps)
+    )
 
 
 def _clocks(updates: Updates, solution: Solution, gaps: Intervals) -> str:
     """Clock offsets as estimated at each update, with one sigma."""
     t, plots = (updates.t_ns - solution.t0_ns) / 1e9, []
     for name, rows in updates.states.items():
-        if not name.endswith(CLOCK) or not len(finite(rows[:, 0])):
+        if not name.endswith(CLOCK) or not len(finite_values(rows[:, 0])):
             continue
         value, sigma = 1e3 * rows.T
         (part,) = parts_of(name, 1)
@@ -74,5 +76,5 @@ def _clocks(updates: Updates, solution: Solution, gaps: Intervals) -> str:
 
 def _core(values: Floats) -> Floats:
     """All but the most extreme 2 % on either side."""
-    v = finite(values)
+    v = finite_values(values)
     return np.percentile(v, [2, 98]) if len(v) else v

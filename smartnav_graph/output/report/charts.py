@@ -14,7 +14,7 @@ from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
-from smartnav_graph.output.report.svg import Axis, Plot, axis, exact_axis, finite, legend, spread_axis, time_axis
+from smartnav_graph.output.report.svg import Axis, Plot, axis, exact_axis, finite_values, legend, spread_axis, time_axis
 from smartnav_graph.output.report.thin import thin_dots
 from smartnav_graph.output.text import count, fixed, metres, number
 
@@ -69,8 +69,10 @@ def shaded(gaps: Intervals) -> list[tuple[str, str]]:
 def uncertainty(solution: Solution, gaps: Intervals, causal: Solution | None) -> str:
     """One-sigma position and heading."""
     t, sigma = solution.seconds, solution.sigmas[:, POS]
-    extra = [] if causal is None else [finite(causal.sigmas[:, POS][:, :2])]
-    position = over_time(solution, spread_axis(np.concatenate([finite(sigma), *extra])), "Position, 1 sigma [m]", gaps)
+    extra = [] if causal is None else [finite_values(causal.sigmas[:, POS][:, :2])]
+    position = over_time(
+        solution, spread_axis(np.concatenate([finite_values(sigma), *extra])), "Position, 1 sigma [m]", gaps
+    )
     if causal is not None:
         horizontal = np.linalg.norm(causal.sigmas[:, POS][:, :2], axis=1)
         position.line(causal.seconds, horizontal, "causal")
@@ -160,7 +162,7 @@ def biases(solution: Solution, gaps: Intervals) -> str:
 
 def _core(values: Floats) -> Floats:
     """The range of a y axis: without the most extreme 1 % on either side."""
-    v = finite(values)
+    v = finite_values(values)
     return np.percentile(v, [1, 99]) if len(v) else v
 
 
@@ -173,7 +175,7 @@ def residual_histograms(solution: Solution) -> str:
     r = solution.residuals
     figures = []
     for sensor in residual_sensors(solution):
-        white = finite(r.whitened[r.of(sensor) & r.used])
+        white = finite_values(r.whitened[r.of(sensor) & r.used])
         if len(white):
             figures.append(_histogram(sensor, white))
     note = [("bars s4", "Residuals over their sigma"), ("line ink", "Standard normal")]
@@ -234,7 +236,7 @@ def _residual_axis() -> Axis:
 
 def distribution(errors: ArrayLike, what: str) -> str:
     """Cumulative distribution of horizontal errors in metres, with 50, 67 and 95 % marked."""
-    e = np.sort(finite(errors))
+    e = np.sort(finite_values(errors))
     if len(e) < 2:
         return ""
     share = 100 * np.arange(len(e)) / (len(e) - 1)  # as the percentiles count
@@ -263,10 +265,10 @@ def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> 
     """Horizontal errors at withheld measurements: their distribution, and over time beside the estimated sigma."""
     horizontal = np.linalg.norm(np.asarray(scored.error, dtype=np.float64)[:, :2], axis=1)
     picture = distribution(horizontal, f"withheld measurements ({title_of(name)})")
-    if len(solution) < 2 or not len(finite(horizontal)):
+    if len(solution) < 2 or not len(finite_values(horizontal)):
         return picture
     sigma = np.linalg.norm(solution.sigmas[:, POS][:, :2], axis=1)
-    y = axis(np.concatenate([horizontal, finite(sigma)]), include=(0.0,))
+    y = axis(np.concatenate([horizontal, finite_values(sigma)]), include=(0.0,))
     plot = over_time(solution, y, "Horizontal error [m]", gaps)
     plot.line(solution.seconds, sigma, "s3")
     plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "withheld")
@@ -286,7 +288,7 @@ def errors_over_time(evaluation: Evaluation, solution: Solution, gaps: Intervals
         plot.line(t, error[:, i], f"s{i} solid")
         plots.append(plot)
     rotation = evaluation.rotation_error_deg
-    if rotation is not None and len(finite(rotation)):
+    if rotation is not None and len(finite_values(rotation)):
         plot = over_time(solution, axis(rotation, include=(0.0,), count=4), "Rotation error [°]", gaps, 130)
         plot.line(t, rotation, "s3")
         plots.append(plot)

@@ -59,15 +59,15 @@ def page(
     gaps = imu_gaps(summary)
     shaded = [(start, start + length) for start, length, _ in gaps]
     parts = [
-        warnings(solution, summary),
+        warnings_section(solution, summary),
         section("map", "Trajectory", track.draw(session, solution, gaps, causal_solution)),
         section("timeline", "Timeline", timeline.draw(solution, summary, shaded, scored)),
-        section("statistics", "Summary", statistics.table(session, solution, summary).html()),
+        section("statistics", "Summary", statistics.statistics_table(session, solution, summary).html()),
         used(session, solution, summary),
         gap_section(summary, gaps),
-        *over_time(solution, shaded, causal_solution),
+        *plots_over_time(solution, shaded, causal_solution),
         section("updates", "Real-time (causal) performance", causal.draw(updates, solution, shaded) if updates else ""),
-        withheld(summary, scored, solution, shaded),
+        withheld_section(summary, scored, solution, shaded),
         against_reference(evaluation, solution, shaded),
         *estimation(summary),
     ]
@@ -126,7 +126,7 @@ def sigma_sentence(solution: Solution) -> str:
     )
 
 
-def warnings(solution: Solution, summary: Summary) -> str:
+def warnings_section(solution: Solution, summary: Summary) -> str:
     """What may be wrong, and what to do."""
     found = usage.lost_warnings(solution) + facts.warnings(summary)
     if not found:
@@ -210,7 +210,7 @@ def gap_section(summary: Summary, gaps: list[ImuGap]) -> str:
     return section("imu-gaps", title, body, {"count": len(gaps), "total-s": total})
 
 
-def over_time(solution: Solution, gaps: charts.Intervals, causal_solution: Solution | None) -> list[str]:
+def plots_over_time(solution: Solution, gaps: charts.Intervals, causal_solution: Solution | None) -> list[str]:
     """The plots over time; none for a run of a single epoch."""
     if len(solution) < 2:
         return []
@@ -232,7 +232,9 @@ def over_time(solution: Solution, gaps: charts.Intervals, causal_solution: Solut
     return [*parts, section("residuals", "Residuals", both)]
 
 
-def withheld(summary: Summary, scored: Mapping[str, charts.Scored], solution: Solution, gaps: charts.Intervals) -> str:
+def withheld_section(
+    summary: Summary, scored: Mapping[str, charts.Scored], solution: Solution, gaps: charts.Intervals
+) -> str:
     """Measurements withheld from the estimate and compared with it."""
     table = usage.withheld_table(summary)
     if not table:

@@ -65,7 +65,7 @@ def key_figures(summary: Summary, uncertainty: Uncertainty | None) -> list[tuple
     return tiles
 
 
-def table(session: Session, solution: Solution, summary: Summary) -> Table:
+def statistics_table(session: Session, solution: Solution, summary: Summary) -> Table:
     """Times, lengths, speeds, heights, extremes of the IMU."""
     rows = [
         *_when_and_where(session, solution),

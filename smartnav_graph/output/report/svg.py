@@ -47,7 +47,7 @@ class Axis:
         return np.asarray((v - self.lo) / (self.hi - self.lo))
 
 
-def finite(values: ArrayLike) -> Floats:
+def finite_values(values: ArrayLike) -> Floats:
     v = np.asarray(values, dtype=np.float64).ravel()
     return v[np.isfinite(v)]
 
@@ -80,7 +80,7 @@ def ticked(lo: float, hi: float, step: float) -> Axis:
 
 def axis(values: ArrayLike, *, count: int = 5, include: Iterable[float] = (), least: float = 0.0) -> Axis:
     """Linear axis over the finite `values`, widened to round limits, spanning `include` and at least `least`."""
-    v = np.concatenate([finite(values), np.fromiter(include, dtype=np.float64)])
+    v = np.concatenate([finite_values(values), np.fromiter(include, dtype=np.float64)])
     lo, hi = (float(v.min()), float(v.max())) if len(v) else (0.0, 1.0)
     span = max(hi - lo, least, 1e-9 * max(abs(lo), abs(hi)), 1e-12)
     middle = (lo + hi) / 2
@@ -105,7 +105,7 @@ def time_axis(lo: float, hi: float, count: int = 12) -> Axis:
 
 def log_axis(values: ArrayLike) -> Axis:
     """Logarithmic axis over the positive finite `values`; ticks 1, 2, 5 x 10^k, or decades when there are many."""
-    v = finite(values)
+    v = finite_values(values)
     v = v[v > 0]
     lo, hi = (float(v.min()), float(v.max())) if len(v) else (0.1, 1.0)
     multiples = (1, 2, 5) if math.log10(hi / lo) < 2.2 else (1,)
@@ -126,7 +126,7 @@ def _log_label(tick: float) -> str:
 
 def spread_axis(values: ArrayLike, *, least: float = 0.0) -> Axis:
     """For standard deviations: logarithmic when they spread over more than a factor of 20, else linear from zero."""
-    v = finite(values)
+    v = finite_values(values)
     v = v[v > 0]
     if len(v) and float(v.max()) > 20 * float(v.min()):
         return log_axis(v)

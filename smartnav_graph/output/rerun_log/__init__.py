@@ -33,7 +33,7 @@ from smartnav_graph.output.rerun_log import (
     states,
     timeline,
 )
-from smartnav_graph.output.rerun_log.recorder import Clock, Recorder, fingerprint, recording_file
+from smartnav_graph.output.rerun_log.recorder import Recorder, RecordingClock, fingerprint, recording_file
 from smartnav_graph.output.rerun_log.viewer import view
 from smartnav_graph.output.summary_json import Summary, table_of
 from smartnav_graph.session.session import Session
@@ -79,11 +79,11 @@ class _Shown:
         return None if self.diagnostics is None else self.diagnostics.updates
 
     @property
-    def clock(self) -> Clock:
+    def clock(self) -> RecordingClock:
         none = np.zeros(0, dtype=np.int64)
         keyframes = none if self.solution is None else self.solution.t_ns
         keyframes = keyframes if self.diagnostics is None else self.diagnostics.keyframe_ns
-        return Clock(self.session.t0_ns, self.session.clock_epoch, keyframes)
+        return RecordingClock(self.session.t0_ns, self.session.clock_epoch, keyframes)
 
 
 def write_recording(
@@ -142,7 +142,7 @@ def write_latency(
         The file exists and `force` is not given, or cannot be written.
     """
     assert diagnostics.updates is not None
-    clock = Clock(session.t0_ns, session.clock_epoch, diagnostics.keyframe_ns)
+    clock = RecordingClock(session.t0_ns, session.clock_epoch, diagnostics.keyframe_ns)
     with replacing(path, force=force) as new, recording_file(new, identity) as stream:
         replays.log_latency(Recorder(stream, clock), diagnostics.updates)
 
@@ -150,7 +150,7 @@ def write_latency(
 def _log_all(recorder: Recorder, shown: _Shown) -> rrb.Blueprint:
     """Write every entity; returns the blueprint that shows them."""
     session, solution = shown.session, shown.solution
-    found = events.find(session, solution, shown.summary)
+    found = events.find_events(session, solution, shown.summary)
     extent = spatial.extent_of(session, solution, shown.causal)
     notes: list[str] = []
     factor = 1.0
@@ -161,7 +161,7 @@ def _log_all(recorder: Recorder, shown: _Shown) -> rrb.Blueprint:
     signals.log_sensors(recorder, session, found.end_ns)
     if solution is not None:
         signals.log_motion(recorder, solution)
-        signals.log_states(recorder, solution, shown.evaluation)
+        signals.log_biases(recorder, solution, shown.evaluation)
         signals.log_residuals(recorder, solution.residuals)
         states.log_states(recorder, table_of(shown.summary, "states"), shown.updates, found.start_ns, found.end_ns)
     views = cameras.views(session, solution is not None)
@@ -184,7 +184,7 @@ def _log_scene(recorder: Recorder, shown: _Shown, extent: spatial.Extent, found:
     import rerun as rr
 
     recorder.style("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    scene = spatial.Scene(recorder, shown.session, extent)
+    scene = spatial.SpatialLog(recorder, shown.session, extent)
     if shown.session.reference is not None:
         scene.path("reference", shown.session.reference.enu, colours.REFERENCE, 0.8)
     if shown.causal is not None:

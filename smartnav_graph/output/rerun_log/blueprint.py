@@ -62,7 +62,7 @@ SMALL = 50.0
 NEAR = 0.25
 
 
-def kind_of(recorder: Recorder, session: Session, solution: Solution | None) -> str:
+def recording_kind(recorder: Recorder, session: Session, solution: Solution | None) -> str:
     """``calibration`` (signals without a path), ``session`` (not solved yet), ``vision``, ``car`` (outdoors) or
     ``indoor``."""
     if solution is None:
@@ -88,7 +88,7 @@ def build(
     of the path."""
     import rerun.blueprint as rrb
 
-    kind = kind_of(recorder, session, solution)
+    kind = recording_kind(recorder, session, solution)
     flat = _row(_flat_views(recorder, session, extent, views))
     left = _stack([_tabs(_scenes(recorder, solution, extent, factor)), flat], [1, 1] if kind == "vision" else [3, 2])
     right = _right(recorder, solution, kind)

@@ -16,7 +16,7 @@ from smartnav_graph.core.files import replacing
 from smartnav_graph.evaluation.compare import MEASURES, Comparison
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, VEL, Solution
 from smartnav_graph.output.rerun_log import blueprint, colours, signals
-from smartnav_graph.output.rerun_log.recorder import Clock, Recorder, fingerprint, recording_file
+from smartnav_graph.output.rerun_log.recorder import Recorder, RecordingClock, fingerprint, recording_file
 from smartnav_graph.output.rerun_log.spatial import Extent, extent_around, finite_rows, nice, thinned
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def write_comparison(
     """
     identity = fingerprint(first, second, names, report_markdown)
     with replacing(path, force=force) as new, recording_file(new, identity) as stream:
-        recorder = Recorder(stream, Clock(first.t0_ns, clock_epoch))
+        recorder = Recorder(stream, RecordingClock(first.t0_ns, clock_epoch))
         recorder.name(f"{names[0]} | {names[1]}", identity)
         extent = extent_around(finite_rows(np.concatenate([first.nav_t_body, second.nav_t_body])))
         factor = _log_scene(recorder, first, second, comparison, extent)

@@ -34,7 +34,7 @@ class Events:
     use: Mapping[str, NDArray[np.int64]]
 
 
-def find(session: Session, solution: Solution | None, summary: Summary) -> Events:
+def find_events(session: Session, solution: Solution | None, summary: Summary) -> Events:
     """The events of a session, its solution and its summary."""
     start, end = span(session, solution)
     use = {name: fix_use(stream, solution) for name, stream in session.absolute().items()}

@@ -27,7 +27,7 @@ State = tuple[str, int]
 
 
 @dataclass
-class Picture:
+class GraphDrawing:
     """The graph at one epoch: nodes with label, place and colour; edges between them."""
 
     ids: list[str] = field(default_factory=list)
@@ -70,7 +70,7 @@ def log_graph(recorder: Recorder, diagnostics: Diagnostics) -> None:
     recorder.style("/graph", rr.GraphEdges.from_fields(graph_type="undirected"))
 
 
-def _pictures(layout: FactorGraphLayout, epochs: NDArray[np.intp]) -> Iterator[Picture]:
+def _pictures(layout: FactorGraphLayout, epochs: NDArray[np.intp]) -> Iterator[GraphDrawing]:
     """The last DEPTH keyframes at each epoch."""
     touched, newest = _touched(layout)
     ending: dict[int, list[int]] = defaultdict(list)
@@ -95,9 +95,9 @@ def _touched(layout: FactorGraphLayout) -> tuple[list[list[State]], list[int]]:
     return touched, newest
 
 
-def picture_of(factors: Sequence[tuple[str, list[State]]], first: int) -> Picture:
+def picture_of(factors: Sequence[tuple[str, list[State]]], first: int) -> GraphDrawing:
     """Factors (builder, states) with the states they touch; keyframes before `first` are one node."""
-    picture = Picture()
+    picture = GraphDrawing()
     states = sorted({state for _, touched in factors for state in touched}, key=_order)
     places: dict[State, tuple[float, float]] = {}
     for state in states:
@@ -118,7 +118,7 @@ def picture_of(factors: Sequence[tuple[str, list[State]]], first: int) -> Pictur
 
 
 def _add_factor(
-    picture: Picture,
+    picture: GraphDrawing,
     name: str,
     sensor: str,
     touched: list[State],

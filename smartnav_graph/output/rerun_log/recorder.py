@@ -44,7 +44,7 @@ def utc_from_gps(t_ns: Times) -> Times:
 
 
 @dataclass(frozen=True)
-class Clock:
+class RecordingClock:
     """Index columns of stamps: `elapsed`, `utc` or `device`, and `keyframe`.
 
     `elapsed` counts from the session's time zero. `utc` exists where the session's clock is a date (unix, gps), else
@@ -90,7 +90,7 @@ class Recorder:
     """
 
     stream: rr.RecordingStream
-    clock: Clock
+    clock: RecordingClock
     paths: set[str] = field(default_factory=set)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     bounds: dict[str, NDArray[np.floating]] = field(default_factory=dict)

@@ -13,13 +13,13 @@ from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.rerun_log import colours
 from smartnav_graph.output.rerun_log.recorder import Recorder
-from smartnav_graph.output.rerun_log.spatial import Scene
+from smartnav_graph.output.rerun_log.spatial import SpatialLog
 
 # Updates, and points of each window, that are drawn at most.
 MOST_WINDOWS, MOST_POINTS = 2000, 60
 
 
-def log_causal(scene: Scene, causal: Solution, updates: Updates | None) -> None:
+def log_causal(scene: SpatialLog, causal: Solution, updates: Updates | None) -> None:
     """The causal path, its latest point, and the window of each update."""
     import rerun as rr
 
@@ -36,7 +36,7 @@ def log_causal(scene: Scene, causal: Solution, updates: Updates | None) -> None:
         _log_windows(scene, updates)
 
 
-def _log_windows(scene: Scene, updates: Updates) -> None:
+def _log_windows(scene: SpatialLog, updates: Updates) -> None:
     """The keyframes that each update can change, after the update."""
     import rerun as rr
 

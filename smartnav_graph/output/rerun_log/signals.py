@@ -72,7 +72,7 @@ def log_bands(
     recorder.widen(path, values - 3.0 * sigmas, values + 3.0 * sigmas)
 
 
-def log_states(recorder: Recorder, solution: Solution, evaluation: Evaluation | None) -> None:
+def log_biases(recorder: Recorder, solution: Solution, evaluation: Evaluation | None) -> None:
     """Biases with their bands, sigmas, and with a reference the error with its bands."""
     sigma, t = solution.sigmas, solution.t_ns
     axes = ["x", "y", "z"]

@@ -106,7 +106,7 @@ def thinned(points: Floats, most: int = MOST_PATH_POINTS) -> Floats:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SpatialLog:
     """Writes positions to the 3D scene and, where an origin is known, to the map."""
 
     recorder: Recorder
@@ -170,7 +170,7 @@ def _known(covariance: Floats) -> Mask:
     return np.asarray(finite & (np.trace(covariance, axis1=1, axis2=2) > 0))
 
 
-def log_solution(scene: Scene, solution: Solution) -> float:
+def log_solution(scene: SpatialLog, solution: Solution) -> float:
     """Path, moving body with axes and velocity, ellipsoids; returns the magnification of those along the path."""
     scene.path("est", solution.nav_t_body, colours.ESTIMATE, 1.5)
     good = np.isfinite(solution.nav_t_body).all(axis=1) & np.isfinite(solution.nav_R_body).all(axis=(1, 2))
@@ -181,7 +181,7 @@ def log_solution(scene: Scene, solution: Solution) -> float:
     return _log_covariance(scene, solution, rows)
 
 
-def _log_body(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> None:
+def _log_body(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp]) -> None:
     import rerun as rr
 
     recorder, t = scene.recorder, solution.t_ns[rows]
@@ -199,7 +199,7 @@ def _log_body(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> None:
         recorder.style("/geo/body", rr.GeoPoints.from_fields(colors=colours.BODY, radii=rr.Radius.ui_points(8.0)))
 
 
-def _log_covariance(scene: Scene, solution: Solution, rows: NDArray[np.intp]) -> float:
+def _log_covariance(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp]) -> float:
     """The ellipsoid at the chosen time, true size, and some along the path, magnified by a round factor."""
     import rerun as rr
 
@@ -226,7 +226,7 @@ def _log_covariance(scene: Scene, solution: Solution, rows: NDArray[np.intp]) ->
     return factor
 
 
-def log_fixes(scene: Scene, events: Events) -> None:
+def log_fixes(scene: SpatialLog, events: Events) -> None:
     """GNSS fixes by their use, the latest fix, and other positions."""
     import rerun as rr
 

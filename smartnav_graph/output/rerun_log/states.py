@@ -35,7 +35,7 @@ def log_states(recorder: Recorder, states: Summary, updates: Updates | None, sta
         times, constant = np.array([start_ns, end_ns], dtype=np.int64), np.full((2, 1), value)
         log_bands(recorder, path, times, constant, np.full((2, 1), sigma), ["final"], "s", colors=[colours.WITHHELD])
     if states:
-        recorder.static("/states", rr.TextDocument(table(states), media_type="text/markdown"))
+        recorder.static("/states", rr.TextDocument(states_markdown(states), media_type="text/markdown"))
 
 
 def clocks(states: Summary) -> list[str]:
@@ -43,7 +43,7 @@ def clocks(states: Summary) -> list[str]:
     return [name for name in states if name.endswith(CLOCK) and "value" in numbers_of(states, name)]
 
 
-def table(states: Summary) -> str:
+def states_markdown(states: Summary) -> str:
     """The states of a summary as Markdown tables, as in the report."""
     parts = [found.markdown() for _, found in tables({"states": states})]
     return "\n\n".join(["# States of the session", *parts]) + "\n"

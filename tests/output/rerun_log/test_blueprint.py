@@ -54,6 +54,6 @@ def test_eye_sees_every_point():
 )
 def test_layout_goes_by_what_the_session_holds(paths, gnss, solved, kind, first):
     session = make_session() if gnss else make_session(gnss=None)
-    held = recorder.Recorder(None, recorder.Clock(T0), paths=paths)
-    assert blueprint.kind_of(held, session, make_solution() if solved else None) == kind
+    held = recorder.Recorder(None, recorder.RecordingClock(T0), paths=paths)
+    assert blueprint.recording_kind(held, session, make_solution() if solved else None) == kind
     assert blueprint._FIRST.get(kind) == first

@@ -54,7 +54,7 @@ def test_gps_time_is_shown_as_utc():
     gps = np.array(["2017-01-01T00:00:16", "2017-01-01T00:00:18"], "datetime64[ns]") - epoch
     utc = recorder.utc_from_gps(gps.astype(np.int64)).astype("datetime64[ns]").astype("datetime64[s]")
     assert [str(t) for t in utc] == ["2016-12-31T23:59:59", "2017-01-01T00:00:00"]
-    assert not recorder.Clock(46_534 * NS, "gps").is_date  # seconds of a day
+    assert not recorder.RecordingClock(46_534 * NS, "gps").is_date  # seconds of a day
 
 
 def test_same_data_give_the_same_recording_and_other_data_another(tmp_path):
