@@ -52,7 +52,7 @@ FACTORS: Mapping[str, Factor] = {
         "imu",
         {
             "imu_bias": Label("IMU bias random walk", assumes="biases change slowly", colour=(200, 110, 70)),
-            "imu_straying": Label("Gap error model", assumes="error of the motion inside IMU data gaps"),
+            "imu_gap_error": Label("Gap error model", assumes="error of the motion inside IMU data gaps"),
         },
     ),
     "gnss": Factor(
@@ -62,7 +62,7 @@ FACTORS: Mapping[str, Factor] = {
         "gnss",
         "gnss",
         {
-            "gnss_wander": Label(
+            "gnss_correlated_error": Label(
                 "Correlated GNSS error (Gauss-Markov)", assumes="successive fixes have correlated errors"
             )
         },

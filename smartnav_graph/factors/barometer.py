@@ -3,7 +3,7 @@
     r = (u + v_u d + b - (h(p) - h_0)) / sigma        b_j = b_i + q
     h(p) = 288.15 / 0.0065 (1 - (p / p_0)^(1 / 5.25588))
 
-u is the height of the body in nav, d how long after the keyframe the mean of its samples stands, h the height of the
+u is the height of the body in nav, d the time from the keyframe to the mean of its samples, h the height of the
 ICAO standard atmosphere. The bias b holds the weather, the undulation of the geoid and the sensor's own offset. Samples
 up to `HALF_S` around a keyframe are taken as one, none twice where keyframes are evenly spaced.
 
@@ -132,7 +132,7 @@ class BarometerBuilder(Builder):
             update.blocks.append(FactorBatch(self.name, MODEL, [keys], data, window.t1_ns, loss=self.loss))
 
     def _around(self, window: Window) -> tuple[float, float, float] | None:
-        """Mean height m, how long after the keyframe it stands s, and its sigma m."""
+        """Mean height m, its time after the keyframe s, and its sigma m."""
         half = int(min(HALF_S, 0.5 * window.length_s or HALF_S) * NS)
         rows = slice(*np.searchsorted(self.t_ns, (window.t1_ns - half, window.t1_ns + half), side="right"))
         count = rows.stop - rows.start

@@ -80,7 +80,7 @@ class Motion:
 class CameraModel:
     """The camera of a session as its factors take it.
 
-    camera : its calibration, or what stands in for one; readout_s : from its first row to its last, zero where rows
+    camera : its calibration, or a substitute; readout_s : from its first row to its last, zero where rows
     are taken as seen at once; boresight_sigma rad, clock_sigma s : priors of its states, zero for none
     """
 

@@ -1,4 +1,4 @@
-"""Surveyed points the sensor head stood on: position factors with the point's own sigma and lever arm."""
+"""Surveyed points under the sensor head: position factors with the point's own sigma and lever arm."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ControlConfig:
 
 
 def build(context: FactorContext) -> PositionBuilder | None:
-    """The builder of a session's surveyed points. Whoever stood on a point read the clock of the device itself."""
+    """The builder of a session's surveyed points. Points are stamped by the clock of the device itself."""
     stream, options = context.session.control, context.options(ControlConfig)
     if stream is None:
         return None

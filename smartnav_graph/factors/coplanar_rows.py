@@ -190,7 +190,7 @@ class PairRows(Matched):
 
 
 def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, Floats]:
-    """Seven rows that stand for normal equations (m, 6, 6) with right side (m, 6) and a sum of squares (m,)."""
+    """Seven rows equivalent to normal equations (m, 6, 6) with right side (m, 6) and a sum of squares (m,)."""
     values, vectors = np.linalg.eigh(normal)
     kept = values > ROUNDING * np.maximum(values[:, -1:], 1e-300)
     scale = np.sqrt(np.where(kept, values, 0.0))

@@ -1,9 +1,9 @@
-"""Coplanarity of matched rays: what two images say of the motion between them, without any point in space.
+"""Coplanarity of matched rays: the motion between two images, without any point in space.
 
-A pair joins when the trajectory without images is found. Its matches are judged by the turn that the inertial data
-tell, then at the smoothed states, then once more, whereupon they are compressed: never by the pair's own fit, which a
-tracker that slipped as a whole makes as well as any other. Where most pairs contradict the inertial solution, that is
-too poor to judge them, and none is used: images never make a trajectory worse.
+A pair joins when the trajectory without images is found. Its matches are tested by the rotation of the
+inertial data, then at the smoothed states, then once more before they are compressed. They are never tested by the
+fit of the pair itself: a tracker that slipped as a whole fits well. Where most pairs are inconsistent with the inertial
+solution, that is too inaccurate to test them, and none is used: images never make a trajectory worse.
 
 Source: Longuet-Higgins (1981), A computer algorithm for reconstructing a scene from two projections, Nature 293; the
 factor in a graph after Indelman, Roberts, Beall, Dellaert (2012), Incremental light bundle adjustment, BMVC.
@@ -32,16 +32,15 @@ from smartnav_graph.session.session import Session
 from smartnav_graph.vision.gating import gate
 from smartnav_graph.vision.pairs import Pairs, pairs_of_matches, pairs_of_tracks
 
-# How sure the turn between two images is, rad and rad/s: what is left of the gyro's bias and noise.
+# Sigma of the rotation between two images, rad and rad/s: remaining bias and noise of the gyro.
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
-# The builder that stands in for pairs once they are settled and it has judged what it is made of.
+# The builder that replaces pairs once they are settled and its own tracks are tested.
 SMART = "smart"
 # Share of its matches that a pair must keep.
 LEAST_SHARE = 0.5
-# Passes until matches are settled (`PassState.settled`): by the rotation,
-# at states found with images, again and compressed.
+# Tests until matches are settled: by the rotation, at states found with images, again and compressed.
 COMPRESSED = 3
-# What a pair's own pose takes of its matches.
+# Degrees of freedom of the relative pose of a pair.
 POSE_DOF = 5
 LEAST_MATCHES = 6  # of a pair
 LOSS_SCALE = 2.0  # of the Cauchy loss of a match, sigmas
@@ -75,10 +74,10 @@ class CoplanarityConfig:
 # Why a pair is not used, in words.
 REASONS = (
     "in use",
-    "outside the stretch",
+    "outside the span",
     "too few matches",
-    "no baseline to speak of",
-    "contradicts the turn or the way",
+    "insufficient baseline",
+    "inconsistent with the other sensors",
 )
 IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
 
@@ -147,18 +146,18 @@ class CoplanarityBuilder(Builder):
     # --- one window ---
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
-        """The pairs whose second image stands at the window's end."""
+        """The pairs whose second image is at the window's end."""
         if pass_state.causal:
             self._causal = self._causal or replace(self._none_selected(), use=np.zeros_like(self.seen.there))
             if previous is not None:
-                self._go_on(window, previous)
+                self._carry(window, previous)
         image = self._image_at(window.t1_ns)
         if image is None:
             return
         self._keyframe[image], self._turn[image] = window.index, self._now
         ending = self._ending(image)
         if self._causal is not None and pass_state.causal:
-            self._look_now(self._causal.rate, self._causal.motion, image, update)
+            self._see_now(self._causal.rate, self._causal.motion, image, update)
             self._select_now(self._causal, self._model(pass_state), ending)
         self._add_pairs(update, ending, pass_state)
 
@@ -199,7 +198,7 @@ class CoplanarityBuilder(Builder):
         )
 
     def replaced(self, pass_state: PassState) -> bool:
-        """Whether tracks stand in for the pairs in a pass with this memory."""
+        """Whether tracks replace the pairs in a pass."""
         return pass_state.tests(SMART) > 0 and not pass_state.causal
 
     def begin(self) -> CoplanarityBuilder:
@@ -212,7 +211,7 @@ class CoplanarityBuilder(Builder):
             return pass_state
         return replace(pass_state, selections={**pass_state.selections, self.name: self._causal})
 
-    def _go_on(self, window: Window, previous: State) -> None:
+    def _carry(self, window: Window, previous: State) -> None:
         """Carry the attitude since the start over one window."""
         for turn in exp((window.gyro - previous.bias.gyroscope()) * window.dt[:, None]):
             self._now = self._now @ turn
@@ -243,7 +242,7 @@ class CoplanarityBuilder(Builder):
         rate = self.rates.mean(self.image_ns, offset_s) - motion.gyro_bias
         return replace(before, rate=rate, motion=motion, pairs=self._at_once(self.seen, offset_s, rate, motion))
 
-    def _look_now(self, rate: Floats, motion: Motion, image: int, update: GraphUpdate) -> None:
+    def _see_now(self, rate: Floats, motion: Motion, image: int, update: GraphUpdate) -> None:
         """Rate and motion at one image of a replay, by prediction."""
         bias = update.bias.gyroscope()
         rate[image] = self.rates.mean(self.image_ns[image : image + 1], 0.0)[0] - bias
@@ -287,12 +286,12 @@ class CoplanarityBuilder(Builder):
         model.use[ending, : use.shape[1]] = use
 
     def by_turn(self, pairs: Pairs, R: Floats) -> tuple[Mask, NDArray[np.intp]]:
-        """Matches that agree with the turn (padded), and the verdict on each pair."""
+        """Matches consistent with the rotation (padded), and the verdict on each pair."""
         sigma = np.hypot(self.sigma, TURN_SIGMA + TURN_DRIFT * pairs.length_s)
         found = gate(pairs, R, sigma)
-        return found.inliers, self.judged(pairs, found.inliers, found.parallax)
+        return found.inliers, self.outcome(pairs, found.inliers, found.parallax)
 
-    def judged(self, pairs: Pairs, use: Mask, parallax: Floats) -> NDArray[np.intp]:
+    def outcome(self, pairs: Pairs, use: Mask, parallax: Floats) -> NDArray[np.intp]:
         """Verdict (n,) by the matches in use (n, k) and the median parallax (n,) rad."""
         kept = use.sum(axis=1)
         share = kept / np.maximum(pairs.count, 1)
@@ -303,7 +302,7 @@ class CoplanarityBuilder(Builder):
 
 def pairs_of(session: Session, config: CoplanarityConfig, *, smart: bool = False) -> Pairs | None:
     """Image pairs of a session: as they were matched, else along tracks; None where images are not to be used, neither
-    by pairs nor (`smart`) by tracks, which takes the images of the pairs."""
+    by pairs nor (`smart`) by tracks, which need the images of the pairs."""
     if not (config.enabled or smart):
         return None
     if session.matches is not None:

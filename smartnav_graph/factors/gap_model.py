@@ -1,22 +1,21 @@
-"""Across a gap in the inertial data: what the recording itself tells of how best to bridge it, and how well that goes.
+"""Interpolation across a gap in the inertial data, with weights and noise fitted to the recording itself.
 
-Force and rate are remembered: their mean over a gap, and the slant that a double integral asks for, are foretold from
-what stands before and after it,
+Mean and slant (first moment, for the double integral) of force and rate over a gap are predicted from features before
+and after it,
 
     sum_j w_j x_j,    x = the samples at the borders, means over 0 - 0.1, 0.1 - 0.3, 0.3 - 0.6 s before and after,
 
-axis by axis, with the weights that serve best on the honest stretches of the same recording, each of which is bridged
-as if it were a gap (ridge regression towards the mean of all looks or the straight line between the borders). Vibration
-asks for long means, a turn for a slope: the recording knows.
+axis by axis, with the weights that fit best on the valid stretches of the same recording, each of which is bridged as
+if it were a gap (ridge regression towards the mean of all features or the straight line between the borders). Vibration
+needs long means, a turn needs a slope.
 
-What is left where the weights were not learnt, part by part of the recording and on stretches that look alike, is the
-noise of the bridge. Readings stray from it and come back, a Brownian bridge beside white noise: over a gap of length T
-the amplitude of the n-th sine has the variance
+The residuals of cross-validation, on stretches with similar features, give the noise of the bridge: a Brownian bridge
+beside white noise. Over a gap of length T the amplitude of the n-th sine has the variance
 
     E a_n^2 = q (T / n pi)^2 + D^2,    a_n = sqrt(2 / T) int e sin(n pi t / T) dt
 
-A vehicle's speed and course change slowly (q), its vertical force and its rolling shake (D). What axes do together,
-the lateral force and the yaw rate of a bend, is told by the products of their amplitudes.
+A vehicle's speed and course change slowly (q), its vertical force and its rolling shake (D). The correlation of
+axes, such as lateral force and yaw rate in a bend, comes from the products of their amplitudes.
 
 Source: Priestley (1981), Spectral Analysis and Time Series, 10.3, on linear interpolation; Hastie, Tibshirani, Friedman
 (2009), The Elements of Statistical Learning, 3.4 and 7.10, on ridge regression and cross-validation; Karatzas, Shreve
@@ -38,38 +37,38 @@ from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session.calibration.model import ImuNoise
 from smartnav_graph.session.streams import Imu
 
-# Moments before and after a gap that are looked at, s.
+# Intervals before and after a gap whose means are features, s.
 MOMENTS = ((0.0, 0.1), (0.1, 0.3), (0.3, 0.6))
-# Honest stretches that weights are found from, at least and at most.
+# Valid stretches that weights are fitted to, at least and at most.
 LEAST, MOST = 30, 2000
-# How many stretches weigh as much as what weights are drawn to: the best is taken.
+# Weight of the target of the ridge regression, in stretches: the best is taken.
 RIDGES = (1e-2, 1.0, 1e6)
-# Share of the stretches, those most alike, that tell the noise of a gap.
+# Share of the stretches, those with the most similar features, that give the noise of a gap.
 ALIKE = 0.1
-# Sines that what is left is told by, and the cells of a stretch that their amplitudes are summed over.
+# Sines of the residuals, and cells of a stretch that their amplitudes are summed over.
 SINES, CELLS = 6, 24
-# Parts of the recording, each of which is bridged by what the others teach.
+# Parts of the recording for cross-validation.
 FOLDS = 6
-# A bridge is never surer than so many times honest data; so many times where there is nothing to learn from.
+# Noise of a bridge in units of that of recorded data: at least, and where nothing can be fitted.
 FLOOR, UNKNOWN = 3.0, 30.0
 
 
 @dataclass(frozen=True)
 class Bridge:
     """Noise densities (3,) accel m/s^2/sqrt(Hz), gyro rad/s/sqrt(Hz) across a gap; expected (2, 6) : mean and slope of
-    force m/s^2 and rate rad/s over it, None where nothing is known and a straight line has to do; wander (6, 6) :
-    the diffusion q a second by which force m/s^2 and rate rad/s stray from that."""
+    force m/s^2 and rate rad/s over it, None for a straight line; diffusion (6, 6) : q per second of the error of
+    force m/s^2 and rate rad/s."""
 
     accel: Floats
     gyro: Floats
     expected: Floats | None = None
-    wander: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    diffusion: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
     def over(self, length_s: float) -> Bridge:
-        """The bridge as white noise alone over a window at whose borders nothing has strayed, or what has is known."""
-        within = np.diag(self.wander) * length_s**2 / 12.0
+        """The bridge as white noise alone over a window at whose borders the error is zero or known."""
+        within = np.diag(self.diffusion) * length_s**2 / 12.0
         white = np.sqrt(np.concatenate([self.accel, self.gyro]) ** 2 + within)
-        return replace(self, accel=white[:3], gyro=white[3:], wander=np.zeros((6, 6)))
+        return replace(self, accel=white[:3], gyro=white[3:], diffusion=np.zeros((6, 6)))
 
 
 class Recorded:
@@ -110,14 +109,14 @@ class Recorded:
         return np.asarray(inside & (self.broken[last] == self.broken[np.maximum(first, 0)]))
 
 
-# A look: before (-1) or after (+1) the gap, from and to s away from it; of no length: the sample at the border.
+# A feature: mean before (-1) or after (+1) the gap, from and to s away; of no length: the sample at the border.
 Feature = tuple[int, float, float]
 FEATURES: tuple[Feature, ...] = tuple((side, a, b) for side in (-1, 1) for a, b in ((0.0, 0.0), *MOMENTS))
 REACH = MOMENTS[-1][1]
 
 
-def _seen(recorded: Recorded, start: Floats, end: Floats, features: Sequence[Feature]) -> Floats:
-    """What the looks (k) show around gaps from `start` to `end` (m,): (m, 6, k)."""
+def _features(recorded: Recorded, start: Floats, end: Floats, features: Sequence[Feature]) -> Floats:
+    """Features (k) of gaps from `start` to `end` (m,): (m, 6, k)."""
     found = []
     for side, a, b in features:
         near, far = (end + a, end + b) if side > 0 else (start - a, start - b)
@@ -128,26 +127,26 @@ def _seen(recorded: Recorded, start: Floats, end: Floats, features: Sequence[Fea
 
 @dataclass(frozen=True)
 class FittedModel:
-    """How mean and slant over a gap of length_s follow from the looks: level (6,) that all counts from, weights
-    (2, 6, k) by axis; left (n, m, 6) : sines of what was left of each stretch where they were not learnt, seen
-    (m, 6, k) : what the looks showed there; together (6, 6) : correlation of what is left."""
+    """Mean and slant over a gap of length_s as a linear function of its features: level (6,) that all are relative to,
+    weights (2, 6, k) by axis; left (n, m, 6) : sines of the cross-validation residuals of each stretch; seen (m, 6, k)
+    its features; correlation (6, 6) of the residuals."""
 
     length_s: float
     level: Floats
     weights: Floats
     left: Floats
     seen: Floats
-    together: Floats
+    correlation: Floats
 
     def predict(self, seen: Floats) -> Floats:
-        """Mean and slant (2, 6) by what the looks (6, k) show."""
+        """Mean and slant (2, 6) of a gap with these features (6, k)."""
         found = np.einsum("jak,ak->ja", self.weights, seen - self.level[:, None])
         found[0] += self.level
         return np.asarray(found)
 
     def noise(self, seen: Floats) -> tuple[Floats, Floats]:
-        """White density (6,) and diffusion (6, 6) by the stretches that looked most alike: a turn is harder to
-        carry on than a straight."""
+        """White density (6,) and diffusion (6, 6) of the stretches with the most similar features: a turn is harder to
+        predict than a straight."""
         apart = np.linalg.norm(self.seen - seen, axis=2)
         count = max(LEAST, round(ALIKE * len(apart)))
         alike = np.argsort(apart, axis=0, kind="stable")[:count]
@@ -155,18 +154,18 @@ class FittedModel:
         frequency = np.pi * np.arange(1, SINES + 1) / self.length_s
         parts = np.stack([np.ones(SINES), frequency**-2.0], axis=1)
         white, root = np.sqrt(np.transpose([nnls(parts, column)[0] for column in spectrum.T]))
-        return white, root[:, None] * self.together * root
+        return white, root[:, None] * self.correlation * root
 
 
 def _fit(recorded: Recorded, length: float, features: Sequence[Feature]) -> FittedModel | None:
-    """Weights for gaps of `length` s; None where there are too few honest stretches."""
+    """Weights for gaps of `length` s; None where there are too few valid stretches."""
     first, last = recorded.t[0] + REACH, recorded.t[-1] - length - REACH
     start = np.arange(first, last, max(length / 4, (last - first) / MOST))
     start = start[recorded.valid(start - REACH, start + length + REACH)]
     if len(start) < LEAST:
         return None
     end = start + length
-    mean, slant, seen = recorded.mean(start, end), recorded.slant(start, end), _seen(recorded, start, end, features)
+    mean, slant, seen = recorded.mean(start, end), recorded.slant(start, end), _features(recorded, start, end, features)
     level = mean.mean(axis=0)
     fold, apart = _folds(start, length + 2.0 * REACH)
     x = (seen - level[:, None]).transpose(1, 0, 2)
@@ -177,12 +176,12 @@ def _fit(recorded: Recorded, length: float, features: Sequence[Feature]) -> Fitt
     weights, error = (np.array([[pair[i] for pair in axes] for axes in best]) for i in range(2))
     predict = np.array([mean, slant]) - error.transpose(0, 2, 1)
     left = _sines(recorded, start, length, predict)
-    return FittedModel(length, level, weights, left, seen, _together(left, (last - first) / length))
+    return FittedModel(length, level, weights, left, seen, _correlation(left, (last - first) / length))
 
 
-def _together(left: Floats, count: float) -> Floats:
-    """Correlation (6, 6) of the axes by sines (n, m, 6), each counting alike, drawn to none with the weight of as many
-    stretches as there are axes; count : stretches that do not overlap."""
+def _correlation(left: Floats, count: float) -> Floats:
+    """Correlation (6, 6) of the axes by sines (n, m, 6), each with the same weight, shrunk to none by as many stretches
+    as there are axes; count : stretches that do not overlap."""
     level = np.sqrt((left**2).mean(axis=1, keepdims=True))
     unit = (left / np.where(level > 0, level, 1.0)).reshape(-1, left.shape[2])
     shrink = count / (count + left.shape[2])
@@ -190,7 +189,7 @@ def _together(left: Floats, count: float) -> Floats:
 
 
 def _sines(recorded: Recorded, start: Floats, length: float, predict: Floats) -> Floats:
-    """Amplitudes (n, m, 6) of the sines of what the curve by mean and slant (2, m, 6) leaves of the stretches."""
+    """Amplitudes (n, m, 6) of the sines of the stretches less the curve by mean and slant (2, m, 6)."""
     x = (np.arange(CELLS) + 0.5) / CELLS
     borders = start[:, None] + length * np.arange(CELLS + 1) / CELLS
     within = np.diff(recorded.at(recorded.integral, borders), axis=1) * CELLS / length
@@ -201,7 +200,7 @@ def _sines(recorded: Recorded, start: Floats, length: float, predict: Floats) ->
 
 
 def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Fold (m,) of every stretch, contiguous in time, and which stretches (folds, m) share nothing with each fold."""
+    """Fold (m,) of every stretch, contiguous in time, and which stretches (folds, m) are disjoint from each fold."""
     edges = np.linspace(start[0], start[-1], FOLDS + 1)
     fold = np.clip(np.searchsorted(edges, start, side="right") - 1, 0, FOLDS - 1)
     apart = (start < edges[:-1, None] - reach) | (start > edges[1:, None] + reach)
@@ -209,7 +208,7 @@ def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bo
 
 
 def _flat(features: Sequence[Feature]) -> list[Floats]:
-    """What the weights of a mean are drawn to: the mean of all looks, or the straight line between the borders."""
+    """Targets of the weights of a mean: the mean of all features, or the straight line between the borders."""
     border = np.array([float(a == b) for _, a, b in features])
     return [np.full(len(features), 1.0 / len(features)), border / border.sum()]
 
@@ -223,7 +222,7 @@ def _slanting(features: Sequence[Feature]) -> list[Floats]:
 def _best(
     y: Floats, x: Floats, fold: NDArray[np.intp], apart: NDArray[np.bool_], targets: Sequence[Floats]
 ) -> tuple[Floats, Floats]:
-    """Weights (k,) for y (m,) from x (m, k) that serve best where they have not been learnt, and their errors (m,)."""
+    """Weights (k,) for y (m,) from x (m, k) that are best in cross-validation, and their errors (m,)."""
     tried = []
     for target in targets:
         for ridge in RIDGES:
@@ -237,7 +236,7 @@ def _best(
 
 
 def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
-    """Weights (k,) for y (m,) from x (m, k), drawn to `target` with the weight of `ridge` stretches."""
+    """Weights (k,) for y (m,) from x (m, k), shrunk to `target` with the weight of `ridge` stretches."""
     if not len(y):
         return target
     normal = x.T @ x
@@ -246,8 +245,8 @@ def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
 
 
 def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> dict[int, Bridge]:
-    """The best bridge of every gap, by its start stamp. Where no honest stretch is as long as a gap, shorter ones stand
-    in. `causal` : each is learnt from what was recorded by `REACH` after it, or in the first `INITIALISATION_S`."""
+    """The best bridge of every gap, by its start stamp. Where no valid stretch is as long as a gap, shorter ones
+    are used. `causal` : each is fitted to what was recorded by `REACH` after it, or in the first `INITIALISATION_S`."""
     if not gaps:
         return {}
     if not causal:
@@ -272,19 +271,19 @@ def _bridge(recorded: Recorded, gap: Gap, imu: Imu, floor: ImuNoise) -> Bridge:
     least = np.array([floor.accel_noise_density] * 3 + [floor.gyro_noise_density] * 3)
     span = gap.length_s
     while span > 2 * float(np.median(np.diff(recorded.t))):
-        learnt = _fit(recorded, span, features)
-        if learnt is not None:
-            seen = _seen(recorded, start, end, features)[0]
-            white, wander = learnt.noise(seen)
+        fitted = _fit(recorded, span, features)
+        if fitted is not None:
+            seen = _features(recorded, start, end, features)[0]
+            white, diffusion = fitted.noise(seen)
             white = np.maximum(white, FLOOR * least)
-            found = Bridge(white[:3], white[3:], learnt.predict(seen), wander)
+            found = Bridge(white[:3], white[3:], fitted.predict(seen), diffusion)
             return found if span == gap.length_s else found.over(span)
         span /= 2
     return Bridge(UNKNOWN * least[:3], UNKNOWN * least[3:])
 
 
 def bridged(imu: Imu, gaps: Sequence[Gap], found: Mapping[int, Bridge]) -> Imu:
-    """The inertial data with a curve of the mean and slant that its bridge tells across every gap: the straight line
+    """The inertial data with a curve of the mean and slant of its bridge across every gap: the straight line
     between its borders and a cubic on it. Where no samples are, the curve is sampled at the recording's own rate."""
     if not gaps:
         return imu
@@ -307,7 +306,7 @@ def _inner(gap: Gap, imu: Imu) -> NDArray[np.int64]:
 
 
 def _curve(x: Floats, first: Floats, last: Floats, predict: Floats) -> Floats:
-    """Values at x from 0 to 1, from `first` to `last` (6,) with the mean and the slant asked for."""
+    """Values at x from 0 to 1, from `first` to `last` (6,) with a given mean and slant."""
     mean, slant = predict
     bump = 6.0 * (mean - 0.5 * (first + last)) - 30.0 * (1.0 - 2.0 * x) * (slant - (last - first) / 6.0)
     return np.asarray((1.0 - x) * first + x * last + x * (1.0 - x) * bump)

@@ -1,9 +1,9 @@
-"""Position fixes whose error wanders: a first-order Gauss-Markov state beside the white part.
+"""Position fixes with a correlated error: a first-order Gauss-Markov state beside the white part.
 
     r = (nav_t_antenna + c - fix) / sigma        c_j = phi c_i + q,  phi = exp(-dt / tau)
 
 Fixes of code receivers (phones) share their atmospheric and multipath errors for a minute or so. Taken as white they
-make the covariance many times too small; scaling the sigma cures nothing.
+make the covariance many times too small; scaling the sigma does not help.
 
 Source: Gelb (1974), Applied Optimal Estimation, 3.8; Niu et al. (2014), GPS Solutions 18(2), on GNSS position noise.
 """
@@ -20,17 +20,17 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 
 
-def wander_sigma(noise: GnssNoise) -> Floats:
+def correlated_sigma(noise: GnssNoise) -> Floats:
     """Sigma (3,) m of the correlated part, nav axes."""
     h, v = noise.correlated_horizontal_sigma, noise.correlated_vertical_sigma
     return np.array([h, h, v])
 
 
-def add_wander(update: GraphUpdate, window: Window, previous: State | None, noise: GnssNoise) -> None:
+def add_correlated_error(update: GraphUpdate, window: Window, previous: State | None, noise: GnssNoise) -> None:
     """The Gauss-Markov state of one keyframe and its tie to the one before."""
     name = key("C", window.index)
     update.chain[name] = np.zeros(3)
-    sigma, tag = wander_sigma(noise), FactorId("gnss_wander", window.t1_ns)
+    sigma, tag = correlated_sigma(noise), FactorId("gnss_correlated_error", window.t1_ns)
     if previous is None:
         update.add(tag, gtsam.PriorFactorVector(name, np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
         return

@@ -1,7 +1,7 @@
 """Position fixes: r = (nav_t_body + nav_R_body * body_t_antenna - fix) / sigma, in nav axes.
 
-GTSAM's GPSFactorArm where that is all; as rows of a model where the clock offset of the receiver, the lever arm or an
-error that wanders are states.
+GTSAM's GPSFactorArm where that is all; as rows of a model where the clock offset of the receiver, the lever arm or a
+correlated error are states.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.gauss_markov import add_wander, wander_sigma
-from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
+from smartnav_graph.factors.gauss_markov import add_correlated_error, correlated_sigma
+from smartnav_graph.factors.observation import PartialPreintegration, at_keyframe, preintegrated, row_model
 from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
@@ -31,7 +31,7 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.session.stream import Positioned
 
-LEAST_WANDERING_SIGMA = 0.5  # m
+LEAST_CORRELATED_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
@@ -43,7 +43,7 @@ class GnssConfig:
     """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``gnc``
     (truncated least squares by graduated non-convexity between Cauchy and gate), ``huber`` or ``none``;
     gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes that carry
-    none from the kept data; correlated : give the wandering error of code receivers a state; time_offset_sigma : s,
+    none from the kept data; correlated : give the correlated error of code receivers a state; time_offset_sigma : s,
     prior of the receiver's clock offset, a state (zero: none); lever_arm_sigma : m, prior of the lever arm as a state
     (zero: taken as known)."""
 
@@ -63,7 +63,7 @@ class GnssConfig:
 
 
 class PositionFix:
-    """Data: fix (3) m, lever arm (3) m body axes, sigma (3) m. `extra`: C adds the wandering error of the fix, L to
+    """Data: fix (3) m, lever arm (3) m body axes, sigma (3) m. `extra`: C adds the correlated error of the fix, L to
     the lever arm."""
 
     width = 9
@@ -93,7 +93,7 @@ def position_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
 
 
 def clock_state(sensor: str, sigma: float, initial: float = 0.0) -> SessionState:
-    """Time offset (s) of a sensor's clock: its rows speak of IMU time t + offset."""
+    """Time offset (s) of a sensor's clock: its rows are of IMU time t + offset."""
     return SessionState("T", sensor, f"{sensor}_time_offset_s", np.array([initial]), np.array([sigma]))
 
 
@@ -157,11 +157,11 @@ class PositionBuilder(Builder):
             typical = stream.available_ns <= first
         return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical)
 
-    def wanders(self, pass_state: PassState) -> bool:
-        """Whether these fixes are a code receiver's: the device's noise says so and they are not better than
-        `LEAST_WANDERING_SIGMA`. Better ones come from carrier phase, whose errors do not wander by metres."""
+    def has_correlated_error(self, pass_state: PassState) -> bool:
+        """Whether these fixes are of a code receiver: by the device's noise, unless they are better than
+        `LEAST_CORRELATED_SIGMA`. Better ones are of carrier phase, without correlated errors of metres."""
         typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
-        return self.noise.is_correlated and self.config.correlated and typical >= LEAST_WANDERING_SIGMA
+        return self.noise.is_correlated and self.config.correlated and typical >= LEAST_CORRELATED_SIGMA
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scale of this sensor."""
@@ -193,15 +193,15 @@ class PositionBuilder(Builder):
             return self.config.loss
         if not pass_state.causal or update.variance is None:
             return "cauchy" if pass_state.phase is Phase.ROBUST else "none"
-        foretold = update.predicted.position() + update.predicted.attitude().matrix() @ self.lever[row]
-        wander = wander_sigma(self.noise) ** 2 if self.name in pass_state.correlated else 0.0
-        square = float(((foretold - self.position[row]) ** 2 / (sigma**2 + update.variance + wander)).sum())
+        predicted = update.predicted.position() + update.predicted.attitude().matrix() @ self.lever[row]
+        correlated = correlated_sigma(self.noise) ** 2 if self.name in pass_state.correlated else 0.0
+        square = float(((predicted - self.position[row]) ** 2 / (sigma**2 + update.variance + correlated)).sum())
         outside = self.gate(np.array([square]), self._level.before(square), np.array([row]))
         return "cauchy" if outside[0] else "none"
 
     def has_second_stage(self, pass_state: PassState) -> bool:
-        """Whether there is more to these fixes once the trajectory is found: states of their own."""
-        return bool(self._states(replace(pass_state, stage=LAST_STAGE))) or self.wanders(pass_state)
+        """See `Builder`: the states of these fixes."""
+        return bool(self._states(replace(pass_state, stage=LAST_STAGE))) or self.has_correlated_error(pass_state)
 
     def _states(self, pass_state: PassState) -> dict[str, SessionState]:
         """Session states in use, by letter."""
@@ -218,9 +218,8 @@ class PositionBuilder(Builder):
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A factor for every row of this stream that became known in the window."""
-        wanders = self.name in pass_state.correlated
-        if wanders:
-            add_wander(update, window, previous, self.noise)
+        if self.name in pass_state.correlated:
+            add_correlated_error(update, window, previous, self.noise)
         states = self._states(pass_state)
         for row in window.rows.get(self.name, ()):
             self._add_row(update, int(row), pass_state, states, self._at_keyframe(update, window, states))
@@ -242,7 +241,7 @@ class PositionBuilder(Builder):
             return update.index, None
         rate = window.gyro[-1] if len(window.dt) else update.bias.gyroscope()
         accel = self.force(window, update.predicted.attitude().matrix(), update.bias.vector())
-        return update.index, here(update.bias, accel, rate, self.gravity)
+        return update.index, at_keyframe(update.bias, accel, rate, self.gravity)
 
     def _add_row(
         self,

@@ -1,14 +1,14 @@
-"""Gravity holds tilt where nothing else does: over some seconds the mean specific force points up.
+"""Tilt from gravity where nothing else holds it: over some seconds the mean specific force points up.
 
     r = [nav_R_body (f - b_a)]_(east, north) / sigma        and        r = nav_v_body / speed
 
 f is the mean of the specific force over a stretch, turned by the gyro to its end: what is left of it beside gravity is
-the change of velocity over the stretch divided by its length. Its sigma grows with the motion: who moves may turn round
+the change of velocity over the stretch divided by its length. Its sigma grows with the motion: a device may turn round
 in a stretch, a share of the scatter of the force does not average out, and a mean whose size is not that of gravity
-tells a lasting acceleration. And whoever is carried by hand stays as slow as a walker, which keeps the velocity that
-nothing else holds from running away.
+means a lasting acceleration. A device in the hand is as slow as a walker, which bounds the velocity where nothing else
+does.
 
-The inertial factors use the same force; they say nothing of tilt unless velocity or position is held, and their noise
+The inertial factors use the same force; they do not determine tilt unless velocity or position is held, and their noise
 is far below this sigma.
 
 Source: Mahony, Hamel, Pflimlin (2008), Nonlinear complementary filters on SO(3), IEEE TAC 53(5), V.
@@ -36,7 +36,7 @@ from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpd
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.streams import ABSOLUTE
 
-# What holds tilt in the end: everything that knows position or velocity.
+# Streams that determine tilt: those of position or velocity.
 HOLDS_TILT = (*ABSOLUTE, "velocity", "wheel")
 ALONE_S = 60.0  # time without any of them from which the force is used
 LEAST_SIGMA = 0.05  # m/s^2, of the mean force of a device at rest
@@ -158,7 +158,7 @@ class GravityBuilder(Builder):
     def sigma(self, mean: Floats, scatter: float, length_s: float) -> float:
         """Sigma (m/s^2) of a mean force (3,) less bias, over `length_s` s, whose size scattered by `scatter` m/s^2.
 
-        A force longer than gravity, sqrt(g^2 + a^2), tells an acceleration a; one off by a small e may as well be bias.
+        A force longer than gravity, sqrt(g^2 + a^2), means an acceleration a; a small difference may be bias.
         """
         excess = max(abs(float(np.linalg.norm(mean)) - self.gravity) - BIAS_SLACK, 0.0)
         parts = [LEAST_SIGMA, SHARE * scatter, np.sqrt(2.0 * self.gravity * excess)]

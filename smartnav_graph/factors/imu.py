@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -29,6 +29,8 @@ from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
 
+Pim = gtsam.PreintegratedImuMeasurements
+Bias = gtsam.imuBias.ConstantBias
 # Bias steps, m/s^2 and rad/s, over which preintegration is repeated.
 STALE_BIAS = np.array([0.1] * 3 + [1e-3] * 3)
 # The same from one pass to the next: passes that come from elsewhere end at the same solution.
@@ -94,7 +96,7 @@ class Kept(NamedTuple):
     window: Window
     bias: Floats
     scales: tuple[float, float]
-    pim: Any
+    pim: Pim
 
 
 @dataclass
@@ -122,10 +124,10 @@ class ImuBuilder(Builder):
     stage: int = 0
     weight: float = CLASS_WEIGHT
     cache: Preintegrated = field(default_factory=Preintegrated)
-    _straying: gap_error.Straying = field(default_factory=gap_error.Straying)
+    _gap_errors: gap_error.GapErrors = field(default_factory=gap_error.GapErrors)
 
     def has_second_stage(self, pass_state: PassState) -> bool:
-        """Whether there is more to learn once the trajectory is found: the noise, scale factors."""
+        """See `Builder`: noise and scale factors are estimated."""
         return self.config.estimate_noise or self.config.scale_sigma > 0
 
     def params(self, pass_state: PassState, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
@@ -149,7 +151,7 @@ class ImuBuilder(Builder):
         middle = (window.t0_ns + window.t1_ns) // 2
         return next(gap for gap in self.gaps if gap.start_ns <= middle <= gap.end_ns)
 
-    def turning(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> PassState:
+    def turning(self, window: Window, bias: Bias, pass_state: PassState) -> PassState:
         """The memory with the gyro's noise of this window raised by what its turn may be off by.
 
         sigma^2 T = (density^2 T) + (share |turn|)^2, for a device of which no more than its class is known, in replay.
@@ -167,7 +169,7 @@ class ImuBuilder(Builder):
         accel = self.noise.accel_bias_walk * pass_state.scale("accel_walk")
         return np.array([accel] * 3 + [self.noise.gyro_bias_walk * pass_state.scale("gyro_walk")] * 3)
 
-    def preintegrate(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> Any:
+    def preintegrate(self, window: Window, bias: Bias, pass_state: PassState) -> Pim:
         """GTSAM preintegrated measurements of one window, linearised at `bias` or, where that is good enough, as an
         earlier pass left them."""
         scales, vector = (pass_state.scale("accel"), pass_state.scale("gyro")), bias.vector()
@@ -179,7 +181,7 @@ class ImuBuilder(Builder):
         self.cache.windows[window.index] = Kept(window, vector, scales, pim)
         return pim
 
-    def _integrated(self, window: Window, bias: gtsam.imuBias.ConstantBias, pass_state: PassState) -> Any:
+    def _integrated(self, window: Window, bias: Bias, pass_state: PassState) -> Pim:
         begin = time.perf_counter()
         pim = gtsam.PreintegratedImuMeasurements(self._params_of(window, pass_state), bias)
         integrate = pim.integrateMeasurement
@@ -188,7 +190,7 @@ class ImuBuilder(Builder):
         self.cache.seconds += time.perf_counter() - begin
         return pim
 
-    def _covariance(self, window: Window, pim: Any, pass_state: PassState) -> Floats:
+    def _covariance(self, window: Window, pim: Pim, pass_state: PassState) -> Floats:
         """Covariance (9, 9) of a window with the noise of `pass_state`, whatever noise it was preintegrated with."""
         scales, old = (pass_state.scale("accel"), pass_state.scale("gyro")), self.cache.windows[window.index].scales
         covariance: Floats = pim.preintMeasCov()
@@ -199,7 +201,7 @@ class ImuBuilder(Builder):
         gyro = (covariance - old[0] ** 2 * accel - integration) / old[1] ** 2
         return np.asarray(scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration)
 
-    def _factor(self, window: Window, pim: Any, pass_state: PassState) -> gtsam.NoiseModelFactor:
+    def _factor(self, window: Window, pim: Pim, pass_state: PassState) -> gtsam.NoiseModelFactor:
         """Factor of a window with the noise of `pass_state`."""
         i, j = window.index - 1, window.index
         factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
@@ -218,19 +220,19 @@ class ImuBuilder(Builder):
             self._cache = cached
         return cached[1]
 
-    def _variance(self, pim: Any, window: Window, previous: State, covariance: Floats) -> Floats:
+    def _variance(self, pim: Pim, window: Window, previous: State, covariance: Floats) -> Floats:
         """Variance (3,) m^2 of the predicted position: the state's before, carried over, and the window's own."""
         gap, length_s = self._gap(window), window.length_s
-        strayed = 0.0 if gap is None else gap_error.largest(gap, self.bridges[gap.start_ns])
+        gap_sigma = 0.0 if gap is None else gap_error.largest(gap, self.bridges[gap.start_ns])
         nav_R_body = previous.nav.attitude().matrix()
         own = np.diag(nav_R_body @ pim.preintMeasCov()[3:6, 3:6] @ nav_R_body.T)
         before = np.diag(covariance)
-        lean = self.gravity**2 * before[:3].max() + strayed**2
+        lean = self.gravity**2 * before[:3].max() + gap_sigma**2
         return np.asarray(before[3:6] + length_s**2 * before[6:9] + (0.5 * length_s**2) ** 2 * lean + own)
 
     def begin(self) -> ImuBuilder:
         """See `Builder.begin`; windows preintegrated before stay at hand."""
-        return replace(self, _straying=gap_error.Straying())
+        return replace(self, _gap_errors=gap_error.GapErrors())
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors of one window; nothing at the first keyframe."""
@@ -250,12 +252,17 @@ class ImuBuilder(Builder):
         update.add(FactorId("imu_bias", window.t1_ns), same)
 
     def _add_inertial(
-        self, update: GraphUpdate, window: Window, previous: State, pim: Any, pass_state: PassState
+        self,
+        update: GraphUpdate,
+        window: Window,
+        previous: State,
+        pim: Pim,
+        pass_state: PassState,
     ) -> None:
         """The window as GTSAM's factor, or as a row where further states change what was read."""
         gap = self._gap(window)
         if gap is not None:
-            ends = self._straying.add(update, window, gap, self.bridges[gap.start_ns])
+            ends = self._gap_errors.add(update, window, gap, self.bridges[gap.start_ns])
             if any(ends):
                 update.blocks.append(gap_error.row(window, ends, previous.bias, pim.preintMeasCov(), self.gravity))
                 return
@@ -265,7 +272,7 @@ class ImuBuilder(Builder):
             return
         used = pim.biasHat().vector()
 
-        def refresh(bias: Any) -> Any:
+        def refresh(bias: Bias) -> gtsam.NonlinearFactor | None:
             if (np.abs(bias.vector() - used) < STALE_BIAS).all():
                 return None
             return self._factor(window, self.preintegrate(window, bias, pass_state), pass_state)

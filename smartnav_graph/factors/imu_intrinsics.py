@@ -12,8 +12,7 @@ Source: Titterton, Weston (2004), Strapdown Inertial Navigation Technology, 8; `
 
 from __future__ import annotations
 
-from typing import Any
-
+import gtsam
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
@@ -51,7 +50,14 @@ def columns(window: Window, bias: Floats, covariance: Floats, gravity: float) ->
     return MODEL.data(window, integrated_with_intrinsics(window, bias), bias, covariance, gravity)
 
 
-def add(update: GraphUpdate, window: Window, bias: Any, covariance: Floats, gravity: float, sigma: float) -> None:
+def add(
+    update: GraphUpdate,
+    window: Window,
+    bias: gtsam.imuBias.ConstantBias,
+    covariance: Floats,
+    gravity: float,
+    sigma: float,
+) -> None:
     """The row of one window, and the state S."""
     i, j = window.index - 1, window.index
     keys = (key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), update.use(scale_state(sigma)))

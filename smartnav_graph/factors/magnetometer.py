@@ -3,9 +3,9 @@
     r = (nav_R_body^T b(F) + A h - y) / sigma        b(F) = (F_h sin d, F_h cos d, F_v)        d declination
 
 y is the mean of the corrected samples of a window, each turned by the gyro to the window's end, and A the same mean of
-what turns the hard iron h (uT, body axes): the samples of a turn tell h and field apart. F holds the horizontal and the
-vertical strength (uT). Where origin and date are known F is that of the World Magnetic Model; where not, all fields on
-Earth are possible, and the magnetometer still says what it can: where north is, up to the iron nearby.
+what turns the hard iron h (uT, body axes): a rotation separates h from the field. F holds the horizontal and
+the vertical strength (uT). Where origin and date are known F is that of the World Magnetic Model; where not, all fields
+on Earth are possible, and the magnetometer still gives north, up to the iron nearby.
 
 The residual is linear in h and F, so their first values do not matter. What iron nearby adds stays alike for a while:
 a row counts as much as that many independent ones.
@@ -37,7 +37,6 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import MagnetometerNoise
 from smartnav_graph.session.streams import Magnetometer
 
-# Streams whose positions tell the heading of whoever moves.
 # Names of the states.
 IRON, STRENGTH = "magnetometer_hard_iron_ut", "magnetometer_field_ut"
 # Horizontal and vertical strength (uT, mean and sigma) of the field anywhere on Earth, for sessions without origin.
@@ -48,11 +47,11 @@ MODEL_SIGMA_UT = 2.0
 EARTHLY_UT = (20.0, 70.0)
 # Cauchy's constant that keeps 95 % efficiency on Gaussian residuals (Holland, Welsch 1977), for rows of three.
 REACH = 2.385 * float(np.sqrt(3.0))
-# More samples than this in a window say nothing new.
+# More samples than this in a window add no information.
 MOST_SAMPLES = 25
-# A held hard iron less sure than this (uT) leaves no usable direction.
+# A fixed hard iron with a larger sigma (uT) leaves no usable direction.
 SURE_IRON_UT = 5.0
-# Tilt (rad) that a prediction may be off when it is asked for dip.
+# Tilt (rad) error of a prediction where it is used for dip.
 TILT = 0.05
 
 
@@ -149,7 +148,7 @@ class MagnetometerBuilder(Builder):
         return replace(self.iron, initial=found[0]), min(found[1], self.iron_sigma)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
-        """One row at the end of the window, where it has samples and the gyro tells how they turned."""
+        """One row at the end of the window, where it has samples and the gyro their rotation."""
         last = int(np.searchsorted(self.t_ns, window.t1_ns, side="right"))
         first = int(np.searchsorted(self.t_ns, window.t0_ns, side="right"))
         if last == first or window.kind in ("first", "gap") or previous is None:
@@ -174,7 +173,7 @@ class MagnetometerBuilder(Builder):
         """Sigma (uT) of a row of `count` samples over `length_s` s.
 
         The mean of a disturbance that stays alike for tau has over a long time the information of one independent value
-        in 2 tau: rows that stand closer share it.
+        in 2 tau: rows closer in time share it.
         """
         return float(np.sqrt(self.noise.sigma_ut**2 / count + self.noise.disturbance_ut**2 * self.shared(length_s)))
 
@@ -206,7 +205,7 @@ def build(context: FactorContext) -> MagnetometerBuilder | None:
     """Builder of the session's magnetometer.
 
     Readings whose first second is stronger than any field on Earth hold an uncalibrated hard iron of that size. Where
-    no positions tell the heading, the magnetometer takes part from the first pass on.
+    there are no positions to determine the heading, the magnetometer is used from the first pass on.
     """
     stream, config = context.session.magnetometer, context.options(MagnetometerConfig)
     if stream is None or not config.enabled:

@@ -1,7 +1,7 @@
 """Measurements of the state at one instant, and the row models that carry them to keyframes.
 
 An `Observation` knows the state (R, p, v) at its own time and nothing else. `AtKeyframe` takes it at a keyframe;
-`AtInstant` at any time after one, foretold by partial preintegration, with the clock offset of its sensor as a state
+`AtInstant` at any time after one, predicted by partial preintegration, with the clock offset of its sensor as a state
 where asked:
 
     R(t) = R_i dR Exp(w d)
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -58,7 +58,7 @@ class Observation(Protocol):
 
 
 class AtKeyframe:
-    """Row model of an observation whose rows stand at keyframes, by a clock that is right."""
+    """Row model of an observation at keyframes, without a clock offset."""
 
     def __init__(self, observation: Observation) -> None:
         self.observation = observation
@@ -110,19 +110,19 @@ class PartialPreintegration(NamedTuple):
 
 _AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 54, "bias": 6, "accel": 3, "gyro": 3, "gravity": 1, "offset": 1}
 WIDTH = sum(_AT.values())
-# No instant is told from its keyframe by less.
+# Shorter times after a keyframe are none.
 SHORTEST_S = 1e-9
 # Bias steps (m/s^2, rad/s) of the numerical derivative of a partial preintegration: its second order is negligible.
 _BIAS_STEP = np.array([1e-3] * 3 + [1e-5] * 3)
 
 
-def here(bias: Any, accel: Floats, gyro: Floats, gravity: float) -> PartialPreintegration:
+def at_keyframe(bias: gtsam.imuBias.ConstantBias, accel: Floats, gyro: Floats, gravity: float) -> PartialPreintegration:
     """The partial preintegration of no length: the instant is the keyframe itself."""
     zero = np.zeros(3)
     return PartialPreintegration(0.0, np.eye(3), zero, zero, np.zeros((9, 6)), bias.vector(), accel, gyro, gravity)
 
 
-def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> PartialPreintegration:
+def preintegrated(window: Window, t_ns: int, bias: gtsam.imuBias.ConstantBias, gravity: float) -> PartialPreintegration:
     """From the keyframe before `window` to the instant `t_ns` inside it, at `bias` (gtsam ConstantBias).
 
     Raises
@@ -135,7 +135,7 @@ def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Parti
     dt = _until(window.dt, (t_ns - window.t0_ns) / NS)
     last = max(len(dt) - 1, 0)
     if not len(dt):
-        return here(bias, window.accel[last], window.gyro[last], gravity)
+        return at_keyframe(bias, window.accel[last], window.gyro[last], gravity)
     pim = gtsam.PreintegratedImuMeasurements(gtsam.PreintegrationParams.MakeSharedU(0.0), bias)
     for accel, gyro, step in zip(window.accel, window.gyro, dt.tolist(), strict=False):
         pim.integrateMeasurement(accel, gyro, step)
@@ -147,7 +147,7 @@ def preintegrated(window: Window, t_ns: int, bias: Any, gravity: float) -> Parti
     )
 
 
-def _by_bias(pim: Any, base: Floats) -> Floats:
+def _by_bias(pim: gtsam.PreintegratedImuMeasurements, base: Floats) -> Floats:
     """Derivative (9, 6) of the deltas by the bias: central differences of GTSAM's own first-order correction, seen in
     what a body at rest in the origin does without gravity."""
     by_bias = np.zeros((9, 6))
@@ -176,9 +176,9 @@ class AtInstant:
     """Row model of an observation at any time after a keyframe.
 
     Data: the observation's columns, then those of `PartialPreintegration.columns`. `timed` adds the time
-    offset T of its sensor (s): the row speaks of IMU time t + T. `short` is for rows at
-    their keyframe (`here`), where the bias matters only through the offset: it is taken as it was when the row was
-    made, and is no state of the row.
+    offset T of its sensor (s): the row is of IMU time t + T. `short` is for rows at
+    their keyframe (`at_keyframe`), where the bias matters only through the offset: it is that of when the row
+    was made, and is no state of the row.
     """
 
     def __init__(self, observation: Observation, *, timed: bool = False, short: bool = False) -> None:

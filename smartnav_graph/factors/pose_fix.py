@@ -3,7 +3,7 @@
     position   nav_t_body + nav_R_body (body_t_sensor + L) - fix = 0                     `gnss.PositionBuilder`
     attitude   Log(nav_R_body body_R_sensor Exp(A) fix^T) = 0                            rad, nav axes
 
-Both at the time t + T that a row stamped t speaks of. L and A correct the mount of the sensor, T its clock; they are
+Both at the time t + T of a row stamped t. L and A correct the mount of the sensor, T its clock; they are
 states. L and A have a prior only where the session does not state the mount.
 
 Source: Sola, Deray, Atchuthan (2018), A micro Lie theory for state estimation in robotics, for the derivatives of Log.
@@ -25,7 +25,7 @@ from smartnav_graph.core.so3 import exp, left_jacobian_inverse, log, right_jacob
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
-from smartnav_graph.factors.observation import PartialPreintegration, here, preintegrated, row_model
+from smartnav_graph.factors.observation import PartialPreintegration, at_keyframe, preintegrated, row_model
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import SessionState, State
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowModel
@@ -36,7 +36,7 @@ from smartnav_graph.session.streams import PoseFix
 
 NAME = "pose_fixes"
 ATTITUDE = "pose_attitude"
-# Where inertial data and fixes of millimetres differ by centimetres the inertial data are wrong: rows are judged by
+# Where inertial data and fixes of millimetres differ by centimetres the inertial data are wrong: rows are tested with
 # this sigma, m, at least when outliers are looked for.
 LEAST_GATE_SIGMA = 0.05
 
@@ -44,7 +44,7 @@ LEAST_GATE_SIGMA = 0.05
 @dataclass(frozen=True)
 class PoseFixConfig:
     """loss, gate_probability : as for GNSS fixes; attitude : use the attitudes of rows that have one;
-    latency_s : known delay of the stamps, a row stamped t speaks of t - latency_s and became known at t;
+    latency_s : known delay of the stamps, a row stamped t is of t - latency_s and became known at t;
     time_offset_sigma : s, prior of what is left of it, a state (zero: none);
     lever_arm_sigma : m, mount_sigma_deg : deg, priors of the corrections of a mount that the session does not state."""
 
@@ -63,7 +63,7 @@ class PoseFixConfig:
 
 
 def undo_latency(session: Session, config: PoseFixConfig) -> Session:
-    """The session with its pose fixes stamped with the time they speak of, where their latency is known."""
+    """The session with its pose fixes stamped with the time of measurement, where their latency is known."""
     fixes = session.pose_fixes
     if fixes is None or config.latency_s == 0:
         return session
@@ -85,12 +85,12 @@ class AttitudeFix:
         """See `observation.Observation`."""
         fix, mount = data[:, :9].reshape(-1, 3, 3), data[:, 9:18].reshape(-1, 3, 3)
         weight = 1.0 / data[:, 18:21, None]
-        foretold = R @ mount @ (exp(extra[0]) if extra else np.eye(3))
-        theta = log(foretold @ fix.transpose(0, 2, 1))
+        predicted = R @ mount @ (exp(extra[0]) if extra else np.eye(3))
+        theta = log(predicted @ fix.transpose(0, 2, 1))
         by_turn = weight * left_jacobian_inverse(theta)
         by_state = np.zeros((len(R), 3, 9))
         by_state[:, :, :3] = by_turn @ R
-        return theta * weight[:, :, 0], by_state, [by_turn @ foretold @ right_jacobian(x) for x in extra]
+        return theta * weight[:, :, 0], by_state, [by_turn @ predicted @ right_jacobian(x) for x in extra]
 
 
 @cache
@@ -101,7 +101,7 @@ def attitude_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
 
 @dataclass
 class PoseFixBuilder(PositionBuilder):
-    """`PositionBuilder` for fixes that may be far better than what inertial data foretell of them.
+    """`PositionBuilder` for fixes that may be far better than their prediction by inertial data.
 
     A redescending loss would believe the inertial data instead, for good: what it is asked for gets Huber's, with a
     sigma of `LEAST_GATE_SIGMA` at least.
@@ -163,7 +163,7 @@ class AttitudeBuilder(Builder):
     def _here(self, update: GraphUpdate, window: Window) -> PartialPreintegration:
         """The instant of the keyframe itself; only its rate matters to an attitude."""
         rate = window.gyro[-1] if len(window.dt) else update.bias.gyroscope()
-        return here(update.bias, np.zeros(3), rate, self.gravity)
+        return at_keyframe(update.bias, np.zeros(3), rate, self.gravity)
 
     def _add_row(
         self,

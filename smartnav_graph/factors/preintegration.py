@@ -1,13 +1,13 @@
 """Inertial windows as rows of a model, with further states that the readings depend on.
 
 Preintegrated rotation, position and velocity follow small changes of the readings to first order; the derivatives by
-whatever states bring such changes about (biases, scale factors, what readings stray by across a gap) are carried along.
+states that cause such changes (biases, scale factors, errors across a data gap) are carried along.
 
 Residual of a window, [rotation on the body side, position, velocity in axes of the first body frame]:
 
     Log(R^T R_j)        R_i^T (p_j - p)        R_i^T (v_j - v)
 
-where R, p, v is the state that keyframe i foretells for j.
+where R, p, v is the state at j predicted from keyframe i.
 
 Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegration, IEEE T-RO 33(1), III-V.
 """

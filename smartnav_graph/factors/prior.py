@@ -43,7 +43,7 @@ class PriorBuilder(Builder):
     start : first state; sigma_rot (3,) rad nav axes, sigma_pos (3,) m or None, sigma_vel (3,) m/s,
     sigma_bias (6,) m/s^2 and rad/s around `bias_mean`; rest_end_ns : end of a rest that begins at the first keyframe.
     attitude is the mean of the rotation prior, that of `start` where there is none of its own. magnetic_stage : its
-    heading comes from the magnetometer, and holds until the magnetometer's own factor speaks, from that stage on.
+    heading comes from the magnetometer, and is used until the magnetometer's own factor is, from that stage on.
     Zero velocity at its keyframes ties tilt to accelerometer bias: a levelled start is off by the one as the other is.
     """
 

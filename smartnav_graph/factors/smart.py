@@ -4,12 +4,12 @@
 
 with x_i in undistorted normalised coordinates. Linearised, a track of l observations is 2 l - 3 rows on l poses: what
 is left once the point is projected out of the null space of its derivatives. A point far away or seen under a small
-angle would be no number, and a wrong observation has no loss of its own, so tracks join late and checked: when image
+angle would be no number, and a wrong observation has no loss of its own, so tracks join late and tested: when image
 pairs have settled the trajectory (or inertial data and fixes alone, where pairs are not asked for), the points are
-found at its states, and what disagrees is left out (`track_gate`). From there on tracks stand in for the pairs, which
-say the same.
+found at its states, and inconsistent ones are left out (`track_outliers`). From there on tracks replace the pairs,
+which hold the same information.
 
-Boresight and clock of the camera, found with the pairs, are held. The keyframe stands at the stamp of the image; what
+Boresight and clock of the camera, found with the pairs, are held. The keyframe is at the stamp of the image; what
 an observation made d later (clock, row of a rolling shutter) differs by at the point and motion found is taken off it.
 
 Source: Carlone, Kira, Beall, Indelman, Dellaert (2014), Eliminating conditionally independent sets in factor graphs,
@@ -38,7 +38,7 @@ from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.vision.points import TrackObservations, observations_of_tracks
 
-# A track needs so many observations: with two, the point takes all but what a pair says.
+# A track needs so many observations: with two, the point leaves no more than a pair.
 LEAST_SEEN = 3
 # Unit of the factors' coordinates: GTSAM ends the search for a point at an absolute change of the squares by one.
 FOCAL = 1e6
@@ -67,10 +67,10 @@ class SmartConfig:
 # Why a track is not used, in words.
 REASONS = (
     "in use",
-    "outside the stretch",
-    "seen too seldom",
-    "no parallax to speak of",
-    "contradicts the way",
+    "outside the span",
+    "too few observations",
+    "insufficient parallax",
+    "inconsistent with the other sensors",
 )
 IN_USE, OUTSIDE, FEW, FLAT, CONTRARY = range(len(REASONS))
 
@@ -136,7 +136,7 @@ class SmartBuilder(Builder):
                 update.add(FactorId(self.name, update.t_ns, row), self._factor(row, selection, pass_state))
 
     def in_force(self, pass_state: PassState) -> bool:
-        """Whether tracks stand in for image pairs in a pass."""
+        """Whether tracks replace image pairs in a pass."""
         return pass_state.tests(self.name) > 0 and not pass_state.causal
 
     def _factor(self, row: int, selection: TrackSelection, pass_state: PassState) -> gtsam.NonlinearFactor:

@@ -5,11 +5,11 @@
     level       u(t) - U = 0                                    stances of a foot-mounted IMU on a declared flat floor
 
 The second is what is called a zero angular rate update: with the inertial factor beside it the gyro's mean reading is
-its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias would let wander.
-A standstill that is none must not bend the trajectory. Steady travel looks like rest: there a row that contradicts
-what else is known lets go (Geman, McClure: the force falls with the cube of the residual). Where a replay knows how
-little it knows, after a minute of dead reckoning, a speed that is merely unknown contradicts nothing. A foot's stance
-is at worst a slower one: beyond `TAIL` sigmas the force is constant.
+its bias. Written as a pair of attitudes it also keeps the heading, which a prior on the bias does not.
+A false standstill must not bend the trajectory. Steady travel looks like rest: there a row that is inconsistent with
+the other sensors has a redescending loss (Geman, McClure: the force falls with the cube of the residual). Its scale
+grows with the sigma of the predicted speed: a speed that is unknown, as after a minute of dead reckoning in a replay,
+is no inconsistency. A false stance of a foot is a slow one: beyond `TAIL` sigmas the force is constant.
 
 Source: Foxlin (2005), Pedestrian tracking with shoe-mounted inertial sensors, IEEE CG&A 25(6); Skog et al. (2010).
 """
@@ -32,11 +32,11 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, StandstillConfig, Standstills
 
 TAIL = 4.0
-# In sigmas: 0.3 m/s of a rest that is sure to a centimetre a second; in metres a second.
-LETS_GO, LETS_GO_SPEED = 30.0, 0.3
-# A speed this many times its sigma contradicts a standstill.
-CONTRADICTS = 5.0
-# The pair of attitudes leaves the positions alone: m.
+# Scale of the redescending loss, in sigmas (0.3 m/s of a rest with a sigma of 1 cm/s), and in m/s.
+LOSS_SCALE, LOSS_SCALE_SPEED = 30.0, 0.3
+# A speed this many times its sigma is inconsistent with a standstill.
+INCONSISTENT = 5.0
+# Position sigma of the pair of attitudes, m: none.
 ANYWHERE = 1e4
 # Prior sigma (m) of the floor's height.
 UNKNOWN_LEVEL = 1000.0
@@ -64,7 +64,7 @@ MODEL = AtKeyframe(Level())
 
 @dataclass
 class StandstillBuilder(Builder):
-    """Adds what a standstill says at each keyframe inside one.
+    """Adds the factors of a standstill at each keyframe inside one.
 
     rests : the standstills of the recording; _floor : the floor's state, once a stance has been seen
     """
@@ -94,19 +94,19 @@ class StandstillBuilder(Builder):
                 self._add_turn(update, turn)
 
     def _add_speed(self, update: GraphUpdate, sigma: float, unknown: float) -> None:
-        lets_go = max(LETS_GO_SPEED / sigma, CONTRADICTS * unknown / sigma, TAIL)
-        zero = gtsam.PriorFactorVector(key("V", update.index), np.zeros(3), self._noise(np.full(3, sigma), lets_go))
+        loss_scale = max(LOSS_SCALE_SPEED / sigma, INCONSISTENT * unknown / sigma, TAIL)
+        zero = gtsam.PriorFactorVector(key("V", update.index), np.zeros(3), self._noise(np.full(3, sigma), loss_scale))
         update.add(FactorId(self.name, update.t_ns), zero)
 
     def _add_turn(self, update: GraphUpdate, sigma: float) -> None:
-        before, here = key("X", update.index - 1), key("X", update.index)
-        model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3), LETS_GO)
-        update.add(FactorId("static_turn", update.t_ns), gtsam.BetweenFactorPose3(before, here, gtsam.Pose3(), model))
+        before, after = key("X", update.index - 1), key("X", update.index)
+        model = self._noise(np.array([sigma] * 3 + [ANYWHERE] * 3), LOSS_SCALE)
+        update.add(FactorId("static_turn", update.t_ns), gtsam.BetweenFactorPose3(before, after, gtsam.Pose3(), model))
 
-    def _noise(self, sigmas: Floats, lets_go: float) -> gtsam.noiseModel.Base:
+    def _noise(self, sigmas: Floats, loss_scale: float) -> gtsam.noiseModel.Base:
         """Diagonal noise under the loss of a rest or of a stance."""
         losses = gtsam.noiseModel.mEstimator
-        loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(lets_go)
+        loss = losses.Huber.Create(TAIL) if self.rests.on_foot else losses.GemanMcClure.Create(loss_scale)
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     def _add_level(self, update: GraphUpdate) -> None:
@@ -126,7 +126,7 @@ def _unknown(previous: State | None) -> float:
 
 
 def build(context: FactorContext) -> StandstillBuilder | None:
-    """The builder, where a session stands still at all."""
+    """The builder, where a session has standstills."""
     if context.rests is None or not context.rests.still.any():
         return None
     return StandstillBuilder(context.rests, context.options(StandstillConfig))

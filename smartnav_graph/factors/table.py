@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph.update import Builder
@@ -24,7 +23,7 @@ class Factor:
 
     label: Label
     build: Callable[[FactorContext], Builder | None] | None = None
-    config: type[Any] | None = None
+    config: type[object] | None = None
     section: str = ""
     stream: str | None = None
     parts: Mapping[str, Label] = field(default_factory=dict)

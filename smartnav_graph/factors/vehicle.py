@@ -4,7 +4,7 @@
     vertical   v_z + w_x y - w_y h + squat f_x v_x = 0        between the axles
 
 v, w and f are velocity, angular rate and specific force of the body in the vehicle's own axes (forward, left, up):
-those that the session declares, turned by a mount pitch and yaw. The state M holds what nobody declares: that pitch and
+those that the session declares, turned by a mount pitch and yaw. The state M is: that pitch and
 yaw (rad), the place (x, y, z) of the rear axle on the road and the lever arm h to where road and body pitch meet (m),
 and two compliances (rad per m/s^2): tyres slip sideways in proportion to the force they bear, a body squats when
 pushed.
@@ -38,8 +38,7 @@ from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, Standstills
 
 MOUNT_SIZE = STATES["M"].dim
 # Seconds before a keyframe over which the rate of the lever arms and the force on tyres and springs are taken: a mean,
-# and what a straight line says of the end. A force that lagged would be in step with the slide that it is part of, and
-# pass for its cause.
+# and the end of a straight line. A delayed force would correlate with the slide that it is part of.
 RATE_S = 0.05
 FORCE_S = 0.6
 COMPLIANCE_SIGMA = 0.01  # rad per m/s^2, prior of the compliances
@@ -124,22 +123,22 @@ class DeclaredVelocity:
 
 class NonHolonomic:
     """Data: angular rate (3) rad/s and specific force (3) m/s^2 in declared vehicle axes, sigma (2) m/s lateral and
-    vertical. Residual (m, 2). strays : inside a gap, where the state G says how far both are from their bridge."""
+    vertical. Residual (m, 2). in_gap : inside a data gap, with the error of both as state G."""
 
     width = 8
 
-    def __init__(self, body_R_vehicle: Floats, *, strays: bool = False) -> None:
+    def __init__(self, body_R_vehicle: Floats, *, in_gap: bool = False) -> None:
         self.body_R_vehicle = body_R_vehicle
-        self.extra: tuple[str, ...] = ("M", "G") if strays else ("M",)
+        self.extra: tuple[str, ...] = ("M", "G") if in_gap else ("M",)
 
     def observe(
         self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
     ) -> tuple[Floats, Floats, list[Floats]]:
         """See `observation.Observation`."""
-        mount, *strayed = extra
+        mount, *gap_error = extra
         measured = data[:, :6].reshape(-1, 2, 3)
-        for more in strayed:
-            measured = measured + more.reshape(-1, 2, 3)[:, ::-1] @ self.body_R_vehicle
+        for error in gap_error:
+            measured = measured + error.reshape(-1, 2, 3)[:, ::-1] @ self.body_R_vehicle
         axes, declared = VehicleAxes.of(mount), DeclaredVelocity.of(R, v, self.body_R_vehicle)
         x, y, z, h, slip, squat = mount[:, 2:].T
         vel, rate, force = axes.turn(declared.rows), axes.turn(measured[:, 0]), axes.turn(measured[:, 1])
@@ -159,12 +158,12 @@ class NonHolonomic:
         by_state = by_velocity @ axes.rotation @ declared.by_state
         by_mount = np.concatenate([by_axes, by_rest], axis=2)
         read = axes.rotation @ self.body_R_vehicle.T
-        by_strayed = [np.concatenate([by_force @ read, by_rate @ read], axis=2) for _ in strayed]
-        return residual * weight[:, :, 0], by_state * weight, [by * weight for by in (by_mount, *by_strayed)]
+        by_error = [np.concatenate([by_force @ read, by_rate @ read], axis=2) for _ in gap_error]
+        return residual * weight[:, :, 0], by_state * weight, [by * weight for by in (by_mount, *by_error)]
 
 
 def mount_state(config: VehicleConfig) -> SessionState:
-    """The vehicle state, shared by all that speaks of the vehicle's own axes."""
+    """The vehicle state, shared by all factors in the vehicle's own axes."""
     return SessionState("M", "vehicle", "vehicle_mount", np.zeros(MOUNT_SIZE), config.prior_sigma)
 
 
@@ -195,7 +194,7 @@ class VehicleBuilder(Builder):
     """Adds one row of the constraint a period, outside standstills, and in gaps where rate and force have a state.
 
     body_R_vehicle (3, 3) : declared axes; gaps : where rate and force were not recorded; rests : where zero velocity
-    says it all already
+    updates are used
     """
 
     body_R_vehicle: Floats
@@ -209,7 +208,7 @@ class VehicleBuilder(Builder):
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
-        self.strayed = AtKeyframe(NonHolonomic(self.body_R_vehicle, strays=True))
+        self.model_in_gap = AtKeyframe(NonHolonomic(self.body_R_vehicle, in_gap=True))
 
     @property
     def noise_groups(self) -> Mapping[str, float]:
@@ -225,9 +224,9 @@ class VehicleBuilder(Builder):
         sigma = [known * pass_state.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
         keys = [key("X", update.index), key("V", update.index), update.use(mount_state(self.config))]
-        strays = key("G", update.index) in update.chain
-        model = self.strayed if strays else self.model
-        keys += [key("G", update.index)] * strays
+        in_gap = key("G", update.index) in update.chain
+        model = self.model_in_gap if in_gap else self.model
+        keys += [key("G", update.index)] * in_gap
         update.blocks.append(
             FactorBatch(self.name, model, [tuple(keys)], data[None], update.t_ns, loss=self.config.loss)
         )

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import gtsam
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
@@ -20,7 +20,7 @@ from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, clock_state
-from smartnav_graph.factors.observation import AtInstant, AtKeyframe, here
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, at_keyframe
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
@@ -88,7 +88,7 @@ NAV_MODEL_TIMED = AtInstant(NavVelocity(), timed=True)
 BODY_MODEL = AtKeyframe(BodyVelocity())
 
 
-def rate_at_end(window: Window, bias: Any) -> Floats:
+def rate_at_end(window: Window, bias: gtsam.imuBias.ConstantBias) -> Floats:
     """Angular rate (3,) rad/s, bias removed, at the window's end; zero where it has no samples."""
     return np.asarray(window.gyro[-1] - bias.gyroscope()) if len(window.dt) else np.zeros(3)
 
@@ -120,7 +120,7 @@ class GnssVelocityBuilder(Builder):
         timed = pass_state.stage >= LAST_STAGE and self.gnss.time_offset_sigma > 0 and len(window.dt) > 0
         if timed:
             states = (*states, key("B", update.index), update.use(clock_state("gnss", self.gnss.time_offset_sigma)))
-            tail = here(update.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
+            tail = at_keyframe(update.bias, window.accel[-1], window.gyro[-1], self.gravity).columns()
         data = np.array([np.concatenate([self.velocity[row], arm, self.sigma[row], tail]) for row in rows])
         used = tuple(bool(known) for known in pass_state.used("gnss", np.array(rows, dtype=np.intp)))
         model = NAV_MODEL_TIMED if timed else NAV_MODEL

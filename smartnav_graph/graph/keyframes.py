@@ -1,6 +1,6 @@
 """Measurements + config -> the windows between keyframes.
 
-Keyframes stand at the union of aiding epochs, at borders of gaps and standstills, and nowhere further apart than a
+Keyframes are at the union of aiding epochs, at borders of gaps and standstills, and nowhere further apart than a
 maximum spacing. Inertial data are cut at keyframes by linear interpolation.
 """
 
@@ -21,7 +21,7 @@ from smartnav_graph.session.streams import Imu
 NOWHERE: Times = np.zeros(0, dtype=np.int64)
 
 
-# Longest window inside a gap, s, or as a share of the gap: as fine as what nobody measured strays.
+# Longest window inside a gap, s, or as a share of the gap: as fine as the error of what was not measured.
 GAP_SPACING_S, GAP_SHARE = 0.5, 0.05
 
 
@@ -54,9 +54,9 @@ def keyframe_times(
 ) -> Times:
     """Strictly increasing keyframe stamps (n,) from span_ns[0] to span_ns[1].
 
-    Aiding epochs win over everything they stand closer to than `merge_s`.
-    `standstills` are the stamps that standstills ask for: their borders, and what lies between. `causal` : where a
-    stamp stands does not depend on when the next measurement comes.
+    An aiding epoch replaces every other stamp closer to it than `merge_s`.
+    `standstills` are the stamps that standstills ask for: their borders, and what lies between. `causal` : a
+    stamp does not depend on when the next measurement comes.
     """
     start, end = span_ns
     merge = int(config.merge_s * NS)
@@ -75,7 +75,7 @@ def keyframe_times(
 
 
 def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float, *, causal: bool) -> Times:
-    """Evenly spaced stamps between those of `fixed` that stand too far apart; `causal` : outside gaps, `spacing_s`
+    """Evenly spaced stamps between those of `fixed` that are too far apart; `causal` : outside gaps, `spacing_s`
     after each other until the next comes."""
     length = np.diff(fixed)
     spacing = np.full(length.shape, spacing_s)

@@ -48,7 +48,7 @@ STATES: dict[str, StateKind] = {
         _kind("B", "imu bias", "keyframe", [0.3] * 3 + [0.02] * 3, [0.01] * 3 + [0.001] * 3),
         _kind("C", "gnss correlated error", "chain", [10.0] * 3, [1.0] * 3),
         _kind("D", "barometer bias", "chain", [10.0], [1.0]),
-        _kind("G", "straying in a gap", "chain", [1.0] * 3 + [0.3] * 3, [0.03] * 3 + [0.01] * 3),
+        _kind("G", "gap error", "chain", [1.0] * 3 + [0.3] * 3, [0.03] * 3 + [0.01] * 3),
         _kind("T", "time offset", "session", [0.3], [0.01]),
         _kind("L", "lever arm", "session", [1.0] * 3, [0.05] * 3),
         _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import gtsam
 import numpy as np
@@ -48,7 +48,7 @@ class RowModel(Protocol):
 
 
 class Measured(NamedTuple):
-    """What rows consist of, where each stands for many measurements: row (n,) of each, whitened residual (n, d), weight
+    """The measurements of rows, where each row has many: row (n,) of each, whitened residual (n, d), weight
     under the loss (n,) and whether it is in use (n,). A `RowModel` of such rows has a method of this name in lower
     case, with the arguments of `linearize`."""
 
@@ -88,8 +88,8 @@ class FactorBatch:
 class GraphUpdate:
     """What one window adds to the graph.
 
-    predicted : state at t1 that the inertial data foretell; variance (3,) of its position m^2, where known
-    foretell : (nav, bias) at t0 -> nav at t1, for states that have moved since
+    predicted : state at t1 predicted by the inertial data; variance (3,) of its position m^2, where known
+    predict : (nav, bias) at t0 -> nav at t1, for states that have changed since
     refresh : bias at t0 -> the inertial factor linearised there, None while the present one is good enough
     chain : initial values of the chain states at this keyframe; session : session states that something here touches;
     constants : those that are held, held : their values, by key
@@ -98,12 +98,12 @@ class GraphUpdate:
     index: int
     t_ns: int
     t_s: float
-    predicted: Any = None
-    bias: Any = None
+    predicted: gtsam.NavState = None  # type: ignore[assignment]  # set by the first builder
+    bias: gtsam.imuBias.ConstantBias = None  # type: ignore[assignment]
     variance: Floats | None = None
-    predict: Callable[[Any, Any], Any] | None = None
-    refresh: Callable[[Any], Any] | None = None
-    factors: list[tuple[FactorId, Any]] = field(default_factory=list)
+    predict: Callable[[gtsam.NavState, gtsam.imuBias.ConstantBias], gtsam.NavState] | None = None
+    refresh: Callable[[gtsam.imuBias.ConstantBias], gtsam.NonlinearFactor | None] | None = None
+    factors: list[tuple[FactorId, gtsam.NonlinearFactor]] = field(default_factory=list)
     blocks: list[FactorBatch] = field(default_factory=list)
     chain: dict[int, Floats] = field(default_factory=dict)
     session: dict[int, SessionState] = field(default_factory=dict)
@@ -129,7 +129,7 @@ class GraphUpdate:
         self.held = {name: np.asarray(values[state.name]) for name, state in self.constants.items()}
         self.session = {name: state for name, state in self.session.items() if name not in self.held}
 
-    def add(self, tag: FactorId, factor: Any) -> None:
+    def add(self, tag: FactorId, factor: gtsam.NonlinearFactor) -> None:
         """Add one native factor."""
         self.factors.append((tag, factor))
 
@@ -137,7 +137,7 @@ class GraphUpdate:
         """Names of what touches this step."""
         return {tag.sensor for tag, _ in self.factors} | {block.sensor for block in self.blocks}
 
-    def refreshed(self, bias: Any) -> bool:
+    def refreshed(self, bias: gtsam.imuBias.ConstantBias) -> bool:
         """Replace the inertial factor by one linearised at `bias`, the present estimate at t0, if that matters."""
         factor = None if self.refresh is None else self.refresh(bias)
         if factor is None:
@@ -149,7 +149,7 @@ class GraphUpdate:
         """Keys of the states this step introduces."""
         return [key(letter, self.index) for letter in KEYFRAME_LETTERS] + list(self.chain)
 
-    def values(self) -> Any:
+    def values(self) -> gtsam.Values:
         """Initial values of the states this step introduces (gtsam.Values)."""
         values = gtsam.Values()
         values.insert(key("X", self.index), self.predicted.pose())

@@ -161,7 +161,7 @@ class WholeGraph:
             held |= update.held
         priors = [session_prior(state) for state in session.values()]
         factors = [factor for update in steps for _, factor in update.factors]
-        return cls(factors + priors, [block for update in steps for block in update.blocks], held)
+        return cls([*factors, *priors], [block for update in steps for block in update.blocks], held)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""

@@ -10,7 +10,7 @@ import pytest
 from exact import GRAVITY
 
 from smartnav_graph.core.timebase import NS, Gap
-from smartnav_graph.factors.gap_error import Straying, row
+from smartnav_graph.factors.gap_error import GapErrors, row
 from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.pass_state import PassState
@@ -37,7 +37,7 @@ def window(index: int, t0_s: float, t1_s: float) -> Window:
 
 def test_the_chain_is_a_brownian_bridge():
     """Covariance q s (T - t) / T of any two times s <= t, from its definition."""
-    times, straying = [10.0, 10.5, 11.7, 13.0, 14.0], Straying()
+    times, straying = [10.0, 10.5, 11.7, 13.0, 14.0], GapErrors()
     graph, values, names = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
     for k in range(1, len(times)):
         update = GraphUpdate(k, round(times[k] * NS), times[k])
@@ -51,7 +51,7 @@ def test_the_chain_is_a_brownian_bridge():
     joint = gtsam.Marginals(graph, values).jointMarginalCovariance(names)
     for i, s in enumerate(times[1:4]):
         for j, t in enumerate(times[1 + i : 4], start=i):
-            wanted = BRIDGE.wander * (s - 10.0) * (14.0 - t) / 4.0
+            wanted = BRIDGE.diffusion * (s - 10.0) * (14.0 - t) / 4.0
             np.testing.assert_allclose(joint.at(names[i], names[j]), wanted, rtol=1e-3, atol=1e-7)
 
 
@@ -83,7 +83,7 @@ def test_a_row_holds_where_the_readings_were_off_by_what_strayed(ends):
 
 def test_nothing_strays_where_nothing_is_learnt():
     update = GraphUpdate(1, 11 * NS, 11.0)
-    assert Straying().add(update, window(1, 10.0, 11.0), GAP, replace(BRIDGE, wander=np.zeros((6, 6)))) == (
+    assert GapErrors().add(update, window(1, 10.0, 11.0), GAP, replace(BRIDGE, diffusion=np.zeros((6, 6)))) == (
         False,
         False,
     )
@@ -92,5 +92,5 @@ def test_nothing_strays_where_nothing_is_learnt():
 
 def test_a_new_pass_knows_nothing_of_the_one_before():
     builder = ImuBuilder(NOISE, GRAVITY, [GAP], {GAP.start_ns: BRIDGE})
-    builder._straying.known.add(3)
-    assert not builder.begin()._straying.known and builder._straying.known == {3}
+    builder._gap_errors.known.add(3)
+    assert not builder.begin()._gap_errors.known and builder._gap_errors.known == {3}

@@ -87,7 +87,7 @@ def wandering(seconds: float, seed: int) -> Imu:
 def test_what_wanders_is_told_from_what_shakes_and_what_goes_together():
     imu = wandering(900.0, 3)
     found = bridges(imu, [hole(imu, 20_000, 150)], NOISE)[int(imu.t_ns[20_000])]
-    q = found.wander
+    q = found.diffusion
     np.testing.assert_allclose(np.sqrt(np.diag(q)[:2]), 0.6, rtol=0.25)
     assert np.sqrt(q[5, 5]) == pytest.approx(0.06, rel=0.25)
     assert q[1, 5] / np.sqrt(q[1, 1] * q[5, 5]) > 0.95 and abs(q[0, 1]) < 0.3 * q[1, 1]
@@ -98,15 +98,15 @@ def test_what_wanders_is_told_from_what_shakes_and_what_goes_together():
 
 def test_a_bridge_over_one_window_has_the_noise_of_its_mean():
     """The mean of a Brownian bridge of diffusion q over T has the variance q T / 12, white noise D^2 / T."""
-    wander = np.zeros((6, 6))
-    wander[0, 0] = 0.49
-    bridge = Bridge(np.full(3, 0.1), np.full(3, 0.02), None, wander)
+    diffusion = np.zeros((6, 6))
+    diffusion[0, 0] = 0.49
+    bridge = Bridge(np.full(3, 0.1), np.full(3, 0.02), None, diffusion)
     rng, T, n = np.random.default_rng(0), 2.0, 200
     walk = np.cumsum(0.7 * np.sqrt(T / n) * rng.standard_normal((4000, n)), axis=1)
     means = (walk - np.linspace(1 / n, 1, n) * walk[:, -1:]).mean(axis=1)
     whole = bridge.over(T)
     assert whole.accel[0] ** 2 / T == pytest.approx(0.01 / T + means.var(), rel=0.1)
-    assert whole.accel[1] == pytest.approx(0.1) and not whole.wander.any()
+    assert whole.accel[1] == pytest.approx(0.1) and not whole.diffusion.any()
 
 
 def test_vibration_is_averaged():

@@ -9,7 +9,7 @@ from exact import LEVER, assemble, assert_derivative, record
 from scipy.stats import chi2
 
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.factors.gauss_markov import add_wander
+from smartnav_graph.factors.gauss_markov import add_correlated_error
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
@@ -41,7 +41,7 @@ def test_every_fix_is_a_row_of_a_block_and_every_keyframe_has_its_state(graph):
     assert len(blocks(graph)) == 30 and graph.factors("gnss") == []
     assert {block.sensor for block in blocks(graph)} == {"gnss"}
     assert [list(step.chain) for step in graph.steps] == [[key("C", w.index)] for w in graph.windows]
-    assert len(graph.factors("gnss_wander")) == len(graph.windows)
+    assert len(graph.factors("gnss_correlated_error")) == len(graph.windows)
     assert len(graph.factors("control")) == 6  # surveyed points do not wander
 
 
@@ -92,7 +92,7 @@ def chain(seconds: np.ndarray) -> gtsam.NonlinearFactorGraph:
     for k, t in enumerate(t_ns):
         update = GraphUpdate(k, int(t), t / NS)
         window = Window(k, int(t_ns[max(k - 1, 0)]), int(t), "normal", np.zeros(0), empty, empty)
-        add_wander(update, window, State(k - 1, 0, None, None) if k else None, NOISE)
+        add_correlated_error(update, window, State(k - 1, 0, None, None) if k else None, NOISE)
         for _, factor in update.factors:
             graph.push_back(factor)
     return graph
@@ -143,4 +143,4 @@ def test_fixes_of_metres_wander(sigma, noise, config, expected):
     fixes = PositionBuilder(
         "gnss", np.zeros((n, 3)), np.full((n, 3), sigma), np.ones(n, dtype=bool), np.zeros(3), config, noise
     )
-    assert fixes.wanders(PassState()) == expected
+    assert fixes.has_correlated_error(PassState()) == expected

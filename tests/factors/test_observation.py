@@ -12,7 +12,14 @@ from numeric import assert_jacobians
 
 from smartnav_graph.core.so3 import exp, rotate, skew
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.factors.observation import WIDTH, AtInstant, AtKeyframe, PartialPreintegration, here, preintegrated
+from smartnav_graph.factors.observation import (
+    WIDTH,
+    AtInstant,
+    AtKeyframe,
+    PartialPreintegration,
+    at_keyframe,
+    preintegrated,
+)
 from smartnav_graph.graph.interpolate import states_at
 from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
 from smartnav_graph.graph.states import STATES
@@ -90,7 +97,7 @@ def test_derivatives_at_an_instant(window, timed, short):
     assert model.letters == ("X", "V", *("B",) * (not short), *("T",) * timed, "L")
     at = partials(window, 5)
     if short:
-        at = [here(gtsam.imuBias.ConstantBias(p.bias[:3], p.bias[3:]), p.accel, p.gyro, GRAVITY) for p in at]
+        at = [at_keyframe(gtsam.imuBias.ConstantBias(p.bias[:3], p.bias[3:]), p.accel, p.gyro, GRAVITY) for p in at]
     columns = np.array([partial.columns(0.01) for partial in at])
     assert columns.shape == (5, WIDTH)
     data = np.concatenate([rng.normal(1.0, 0.3, (5, 4)), columns], axis=1)
@@ -200,7 +207,7 @@ def test_a_nominal_offset_is_part_of_the_instant(window):
 def test_nothing_passes_at_the_keyframe_itself(window):
     partial = preintegrated(window, window.t0_ns, NO_BIAS, GRAVITY)
     assert partial.dt == 0.0 and not partial.by_bias.any() and np.array_equal(partial.dR, np.eye(3))
-    at = here(NO_BIAS, window.accel[0], window.gyro[0], GRAVITY)
+    at = at_keyframe(NO_BIAS, window.accel[0], window.gyro[0], GRAVITY)
     np.testing.assert_array_equal(partial.columns(), at.columns())
 
 

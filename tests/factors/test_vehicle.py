@@ -85,7 +85,7 @@ def test_derivatives(model):
     state = rng.normal(0, 1, (m, MOUNT_SIZE)) * [0.5, 0.5, 1, 1, 1, 1, 0.02, 0.02]
     R, p, v = random_rotations(rng, m), rng.normal(0, 100, (m, 3)), rng.normal(0, 10, (m, 3))
     assert_observation(model, R, p, v, [state], data)
-    strays = NonHolonomic(model.body_R_vehicle, strays=True)
+    strays = NonHolonomic(model.body_R_vehicle, in_gap=True)
     assert_observation(strays, R, p, v, [state, rng.normal(0, 0.3, (m, 6))], data)
 
 
@@ -96,7 +96,7 @@ def test_what_readings_stray_by_is_added_to_them():
     axes, velocity = PHONE.body_R_vehicle, (-0.4, 9.0, 0.2)
     data = np.concatenate([rate, force, (1.0, 1.0)])[None]
     at = (np.eye(3)[None], np.zeros((1, 3)), np.array([velocity]))
-    found = NonHolonomic(axes, strays=True).observe(*at, [state[None], strayed[None]], data)[0][0]
+    found = NonHolonomic(axes, in_gap=True).observe(*at, [state[None], strayed[None]], data)[0][0]
     raised = residual(PHONE, np.eye(3), velocity, state, rate + strayed[3:] @ axes, force + strayed[:3] @ axes)
     assert found == pytest.approx(raised)
 

@@ -24,7 +24,7 @@ from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.update import OBSERVED
 from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
-from smartnav_graph.factors.gauss_markov import wander_sigma
+from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.session.session import Session
@@ -184,8 +184,8 @@ def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
     found |= _inertial_noise(problem, pass_state) | _row_noise(problem, pass_state)
     for builder in position_builders(problem.builders):
         if builder.name in pass_state.correlated:
-            found[f"{builder.name}_wander_sigma_m"] = {
-                "value": [float(s) for s in wander_sigma(builder.noise)],
+            found[f"{builder.name}_correlated_sigma_m"] = {
+                "value": [float(s) for s in correlated_sigma(builder.noise)],
                 "sigma": None,
                 "held": True,
             }

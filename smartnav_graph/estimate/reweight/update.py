@@ -149,7 +149,7 @@ def extra_passes(builders: Iterable[Builder]) -> int:
 def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The pass state with what joins once the trajectory is found; session states that are not observable are fixed."""
     positions = position_builders(builders)
-    correlated = frozenset(b.name for b in positions if b.wanders(pass_state))
+    correlated = frozenset(b.name for b in positions if b.has_correlated_error(pass_state))
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
@@ -184,7 +184,7 @@ def _inertial(
     solution follows slow errors of the sensor as it follows those of the fixes, and residuals show the fast part.
     Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
     scales = noise_scales(builders, windows, estimate, pass_state, level)
-    if any(builder.wanders(pass_state) for builder in position_builders(builders)):
+    if any(builder.has_correlated_error(pass_state) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
     if pass_state.outlier_tests or one_of(builders, VehicleBuilder) is not None:
         scales = {name: max(scale, pass_state.scale(name)) for name, scale in scales.items()}

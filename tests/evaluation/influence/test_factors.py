@@ -68,5 +68,8 @@ def test_a_round_trip_is_exact(influence, tmp_path):
 
 
 def test_tags_are_told_by_their_builder():
-    told = [builder_of(tag) for tag in ("imu_bias", "gnss_velocity", "gnss_wander", "static_turn", "rest", "prior")]
+    told = [
+        builder_of(tag)
+        for tag in ("imu_bias", "gnss_velocity", "gnss_correlated_error", "static_turn", "rest", "prior")
+    ]
     assert told == ["imu", "gnss_velocity", "gnss", "static", "prior", "prior"]

@@ -79,7 +79,7 @@ def test_counts_and_verdicts_stand_on_the_time_line(found):
     counts = found.values("/pairs/matches", "Scalars:scalars")
     assert counts.tolist() == [[1, 1], [2, 1], [0, 2], [0, 1]]
     states = found.texts("/status/image_pairs", "StateChange:state")
-    assert states == ["in use", "contradicts the turn or the way", "no baseline to speak of"]
+    assert states == ["in use", "inconsistent with the other sensors", "insufficient baseline"]
     when = found.index("/status/image_pairs", "StateChange:state", "elapsed") / NS
     assert when.tolist() == [2.0, 4.0, 5.0]
     assert {"Camera cam0", "Matches of image pairs"} <= set(found.view_names())
