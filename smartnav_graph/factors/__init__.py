@@ -3,8 +3,8 @@
 A new factor adds a file here and a row in `FACTORS`; the options of a run, the report and the recording are made from
 it. A new sensor also adds a stream to `session.streams`.
 
-A default sigma has one home: noise of a device in `session.calibration.model`, sigma of a model assumption or prior in
-the `Config` of its factor, which a user may set.
+A default sigma has one home: noise of a device or of what carries it in `session.calibration.model` (calibration.toml),
+sigma of a model assumption or of a prior in the module of its factor, in its `Config` where a user may set it.
 """
 
 from __future__ import annotations

@@ -12,15 +12,11 @@ from smartnav_graph.session.calibration.model import GnssNoise
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """default_sigma : m, of points that carry none; lever_arm_sigma : m, prior of the lever arm as a state (zero:
-    taken as known)."""
+    """lever_arm_sigma : m, prior of the lever arm as a state (zero: taken as known)."""
 
-    default_sigma: float = 0.05
     lever_arm_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.default_sigma > 0:
-            raise ConfigError("config [control]", f"default_sigma = {self.default_sigma}", "> 0 m")
         if self.lever_arm_sigma < 0:
             raise ConfigError("config [control]", f"lever_arm_sigma = {self.lever_arm_sigma}", ">= 0 m")
 
@@ -39,5 +35,6 @@ def build(context: FactorContext) -> PositionBuilder | None:
         time_offset_sigma=0.0,
         lever_arm_sigma=options.lever_arm_sigma,
     )
-    noise = GnssNoise(options.default_sigma, options.default_sigma)
+    sigma = context.calibration.control_noise.position_sigma
+    noise = GnssNoise(sigma, sigma)
     return PositionBuilder.of(context, "control", stream, noise, config)

@@ -28,7 +28,6 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
@@ -208,7 +207,7 @@ def _good_fixes(context: FactorContext) -> NDArray[np.int64]:
     found = [np.zeros(0, np.int64)]
     for stream, usual in (
         (session.gnss, context.calibration.gnss_noise.horizontal_sigma),
-        (session.control, context.options(ControlConfig).default_sigma),
+        (session.control, context.calibration.control_noise.position_sigma),
         (session.pose_fixes, context.calibration.pose_fix_noise.position_sigma),
     ):
         if stream is not None:

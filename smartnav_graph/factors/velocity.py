@@ -15,7 +15,6 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
@@ -34,16 +33,12 @@ APART_S = 0.5
 
 @dataclass(frozen=True)
 class VelocityConfig:
-    """gnss : use the velocities that come with GNSS fixes; default_sigma : m/s, of body velocities that carry none;
-    loss : of a row, ``none``, ``huber`` or ``cauchy``."""
+    """gnss : use the velocities that come with GNSS fixes; loss : of a row, ``none``, ``huber`` or ``cauchy``."""
 
     gnss: bool = True
-    default_sigma: float = 0.1
     loss: str = "huber"
 
     def __post_init__(self) -> None:
-        if not self.default_sigma > 0:
-            raise ConfigError("config [velocity]", f"default_sigma = {self.default_sigma}", "> 0 m/s")
         check_loss("velocity", self.loss)
 
 
@@ -130,10 +125,14 @@ class GnssVelocityBuilder(Builder):
 
 @dataclass
 class BodyVelocityBuilder(Builder):
-    """Adds one body velocity a keyframe, interpolated between the readings around it."""
+    """Adds one body velocity a keyframe, interpolated between the readings around it.
+
+    default_sigma : m/s, of readings without sigma
+    """
 
     stream: Velocity
     lever: Floats
+    default_sigma: float
     config: VelocityConfig
     name: str = "velocity"
     stage: int = 0
@@ -160,7 +159,7 @@ class BodyVelocityBuilder(Builder):
             return None
         share = 0.0 if after == before else float((t_ns - stamps[before]) / (stamps[after] - stamps[before]))
         mix = np.array([1.0 - share, share])
-        own = np.full(3, self.config.default_sigma) if self.stream.sigma is None else self.stream.sigma[before]
+        own = np.full(3, self.default_sigma) if self.stream.sigma is None else self.stream.sigma[before]
         return mix @ self.stream.velocity[[before, after]], own * float(np.sqrt((mix**2).sum()))
 
 
@@ -184,4 +183,5 @@ def build(context: FactorContext) -> BodyVelocityBuilder | None:
     if stream is None:
         return None
     lever = np.asarray(context.session.mount("velocity").body_t, dtype=np.float64)
-    return BodyVelocityBuilder(stream, lever, context.options(VelocityConfig))
+    sigma = context.calibration.velocity_noise.velocity_sigma
+    return BodyVelocityBuilder(stream, lever, sigma, context.options(VelocityConfig))

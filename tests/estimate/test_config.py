@@ -46,7 +46,7 @@ def test_every_section_is_a_frozen_room():
         ({"gnss": {"loss": "tukey"}}, ("config [gnss]: loss = 'tukey'; expected gate, gnc, huber or none",)),
         ({"gnss": {"gate_probability": 1.5}}, ("gate_probability = 1.5; expected between 0.5 and 1",)),
         ({"imu": {"integration_sigma": 0.0}}, ("config [imu]",)),
-        ({"control": {"default_sigma": -1.0}}, ("config [control]: default_sigma = -1.0",)),
+        ({"control": {"lever_arm_sigma": -1.0}}, ("config [control]: lever_arm_sigma = -1.0",)),
         ({"keyframes": {"max_spacing_s": 0.0}}, ("config [keyframes]: max_spacing_s = 0.0", "> merge_s >= 0")),
         ({"keyframes": {"merge_s": 2.0}}, ("merge_s = 2.0",)),
         ({"keyframes": {"lead_s": -1.0}}, ("config [keyframes]",)),

@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 from exact import LEVER, assemble, record
 
-from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors import FACTORS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.control import ControlConfig
 from smartnav_graph.graph.pass_state import PassState
-from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.calibration.model import Calibration, ControlNoise
 from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import ControlPoint
 
 
-def made(session, **config):
-    context = FactorContext(session, Calibration(), (), "none", Config(control=ControlConfig(**config)))
+def made(session, sigma=0.05):
+    context = FactorContext(session, Calibration(control_noise=ControlNoise(sigma)), (), "none", Config())
     return FACTORS["control"].build(context)
 
 
@@ -26,10 +25,10 @@ def points(**sigma) -> ControlPoint:
     return ControlPoint(t_ns=[0, 1], enu=np.eye(3)[:2], point_id=["A", "B"], **sigma)
 
 
-def test_points_without_sigma_take_the_default_of_the_room():
+def test_points_without_sigma_take_that_of_the_calibration():
     session = record().session.replace(control=points())
     np.testing.assert_array_equal(made(session).sigma, 0.05)
-    np.testing.assert_array_equal(made(session, default_sigma=0.2).sigma, 0.2)
+    np.testing.assert_array_equal(made(session, 0.2).sigma, 0.2)
 
 
 def test_a_points_own_sigma_and_lever_arm_are_used():
@@ -70,6 +69,6 @@ def test_without_points_there_is_no_builder():
 
 
 @pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan")])
-def test_config_refuses_a_sigma_that_is_not_positive(sigma):
-    with pytest.raises(ConfigError, match=r"config \[control\]: default_sigma = .*; expected > 0 m"):
-        ControlConfig(sigma)
+def test_a_sigma_that_is_not_positive_is_refused(sigma):
+    with pytest.raises(CalibrationError, match=r"position_sigma = .*; expected a finite number > 0"):
+        Calibration(control_noise=ControlNoise(sigma))

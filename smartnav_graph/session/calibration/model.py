@@ -80,6 +80,20 @@ VEHICLE_CLASSES: dict[str, VehicleNoise] = {
 
 
 @dataclass(frozen=True)
+class ControlNoise:
+    """Sigma per axis of surveyed points without sigma, m: of the point, and of setting the device over it."""
+
+    position_sigma: float = 0.05
+
+
+@dataclass(frozen=True)
+class VelocityNoise:
+    """Sigma per axis of body velocities without sigma, m/s, as of an odometer or a flow sensor."""
+
+    velocity_sigma: float = 0.1
+
+
+@dataclass(frozen=True)
 class BarometerNoise:
     """pressure_sigma : hPa, white, a sample; pressure_walk : hPa/sqrt(s), weather, draughts and the sensor itself."""
 
@@ -197,7 +211,9 @@ class Calibration:
     device_class: str = "mems"
     imu_noise: ImuNoise = field(default_factory=lambda: DEVICE_CLASSES["mems"])
     gnss_noise: GnssNoise = field(default_factory=GnssNoise)
+    control_noise: ControlNoise = field(default_factory=ControlNoise)
     pose_fix_noise: PoseFixNoise = field(default_factory=PoseFixNoise)
+    velocity_noise: VelocityNoise = field(default_factory=VelocityNoise)
     barometer_noise: BarometerNoise = field(default_factory=BarometerNoise)
     step_noise: StepNoise = field(default_factory=StepNoise)
     range_noise: RangeNoise = field(default_factory=RangeNoise)
@@ -207,7 +223,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         noises = (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise)
-        for part in (*noises, self.range_noise):
+        for part in (*noises, self.range_noise, self.control_noise, self.velocity_noise):
             for f in dataclasses.fields(part):
                 value = getattr(part, f.name)
                 may_be_zero = f.name.endswith("_sigma") and f.name.startswith(("correlated_", "bias_"))
