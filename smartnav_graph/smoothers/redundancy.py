@@ -26,17 +26,19 @@ CALIBRATION = "calibration"
 
 
 class Redundancy(NamedTuple):
-    """Of the factors of one name: residuals (their number), and fitted, the sum of tr(J P J^T) over them."""
+    """Of the factors of one name: residuals (their number), fitted, the sum of tr(J P J^T) over them, and square, that
+    of their whitened residuals, under the weight of their loss."""
 
-    residuals: int
-    fitted: float
+    residuals: int = 0
+    fitted: float = 0.0
+    square: float = 0.0
 
     @property
     def value(self) -> float:
         return self.residuals - self.fitted
 
     def __add__(self, other: Any) -> Redundancy:
-        return Redundancy(self.residuals + other.residuals, self.fitted + other.fitted)
+        return Redundancy(*(one + more for one, more in zip(self, other, strict=True)))
 
 
 def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
@@ -62,9 +64,9 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     found: dict[str, Redundancy] = {}
     for row, joint in joint_covariances(linear.eliminateSequential(order, gtsam.EliminateQR), groups, session):
         for name, factor in factors.get(row, ()):
-            J = factor.jacobian()[0]
+            J, residual = factor.jacobian()
             fitted = float(((J @ joint.of(factor.keys())) * J).sum())
-            found[name] = found.get(name, Redundancy(0, 0.0)) + Redundancy(len(J), fitted)
+            found[name] = found.get(name, Redundancy()) + Redundancy(len(J), fitted, float(residual @ residual))
     return found
 
 

@@ -123,4 +123,4 @@ def test_the_command(walk, tmp_path, capsys):
     assert "--every: 'x'; expected numbers separated by commas" in capsys.readouterr().err
     session_folder.save(walk.replace(reference=None), tmp_path / "bare")
     assert main(["intervals", str(tmp_path / "bare"), "--every", "1", "--reference", str(tmp_path / "bare")]) == 1
-    assert "holds no reference" in capsys.readouterr().err
+    assert "contains no reference" in capsys.readouterr().err

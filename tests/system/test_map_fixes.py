@@ -78,7 +78,7 @@ def test_a_model_holds_the_trajectory(workshop, capsys):
     assert "exists already; expected a session without it; add --force" in capsys.readouterr().err
     assert match(folder, "--known", f"{folder}/without", "--force") == 0
     told = capsys.readouterr().out
-    assert f"{len(fixes)} images are the session's" in told and "a unit of the model is 4.7" in told
+    assert f"{len(fixes)} images of the session" in told and "one unit of the model is 4.7" in told
 
     arguments = ["smooth", f"{folder}/room", "--quiet", "--sensors", "pose_fixes", "--out", f"{folder}/alone"]
     assert main(arguments) == 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,13 +14,14 @@ from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
 from smartnav_graph.factors import builder_of
 from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.graph.robust import expected_weighted_square
-from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.graph.solution import Solution
 from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
 
 # Redundancy below which a sum of squares tells nothing of a sensor's noise.
 LEAST_REDUNDANCY = 1.0
-# Image pairs: matches within their gate count in full, their loss would make the sum too small.
-UNWEIGHTED = "image_pairs"
+# Factors that stand for many measurements, matches or observations of tracks, each of which has a residual. Those in
+# use are inside their gate and count in full: under their loss the sum would be too small.
+IMAGES = ("image_pairs", SMART)
 
 
 @dataclass(frozen=True)
@@ -71,28 +72,19 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.Tr
     """Of a solved problem and the residuals of its keyframes."""
     parts: dict[str, SensorFit] = {}
     for name, found in redundancies(solved.estimate).items():
-        count, square = _squares(solved, solution.residuals, name)
-        count = count or found.residuals  # of priors, which have no row among the residuals
+        count, square = found.residuals, found.square / _expected(solved, name)
+        if name in IMAGES:
+            rows = solution.residuals.of(name) & solution.residuals.used
+            count, square = int(rows.sum()), float((solution.residuals.whitened[rows] ** 2).sum())
         if name == SMART and tracks is not None:
             count -= POINT_DOF * tracks.points
-        builder = builder_of(name)
-        before = parts.get(builder, SensorFit())
-        parts[builder] = replace(
-            before,
+        before = parts.get(builder_of(name), SensorFit())
+        parts[builder_of(name)] = SensorFit(
             residuals=before.residuals + count,
             redundancy=before.redundancy + count - found.fitted,
             square=before.square + square,
         )
     return Chi2(solved.estimate.cost, parts)
-
-
-def _squares(solved: SolvedProblem, residuals: Residuals, name: str) -> tuple[int, float]:
-    """Number of the residuals of one kind of factor in use, and the sum of their squares over its expectation."""
-    rows = residuals.of(name) & residuals.used
-    square = residuals.whitened[rows] ** 2
-    if name == UNWEIGHTED:
-        return int(rows.sum()), float(square.sum())
-    return int(rows.sum()), float((residuals.weight[rows] * square).sum()) / _expected(solved, name)
 
 
 def _expected(solved: SolvedProblem, name: str) -> float:
