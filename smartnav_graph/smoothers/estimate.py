@@ -271,7 +271,7 @@ class JointCovariance:
     def of(self, names: Sequence[int]) -> Floats:
         """The covariance of the states `names`, in their order."""
         columns = np.array([i for name in names for i in range(self.at[name].start, self.at[name].stop)], dtype=np.intp)
-        return np.asarray(self.covariance[np.ix_(columns, columns)])
+        return np.asarray(self.covariance[columns[:, None], columns])
 
     def only(self, names: Sequence[int]) -> JointCovariance:
         """The same without all other states."""
@@ -300,7 +300,10 @@ class JointCovariance:
         gain = inverse @ S
         cross = -gain @ self.covariance
         own = inverse @ inverse.T - cross @ gain.T
-        return JointCovariance(_slices([*names, *self.at]), np.block([[own, cross], [cross.T, self.covariance]]))
+        joint = np.empty((size + len(self.covariance),) * 2)
+        joint[:size, :size], joint[:size, size:], joint[size:, :size] = own, cross, cross.T
+        joint[size:, size:] = self.covariance
+        return JointCovariance(_slices([*names, *self.at]), joint)
 
 
 def _slices(names: Iterable[int]) -> dict[int, slice]:

@@ -11,14 +11,16 @@ Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.2 (redund
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, indices_of, key, kind_of
-from smartnav_graph.smoothers.estimate import Estimate, joint_covariances
+from smartnav_graph.smoothers.estimate import Estimate, JointCovariance, joint_covariances
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 # Source of the priors of the session's states (clock offsets, lever arms, mounts).
@@ -29,16 +31,13 @@ class Redundancy(NamedTuple):
     """Of the factors of one name: residuals (their number), fitted, the sum of tr(J P J^T) over them, and square, that
     of their whitened residuals, under the weight of their loss."""
 
-    residuals: int = 0
-    fitted: float = 0.0
-    square: float = 0.0
+    residuals: int
+    fitted: float
+    square: float
 
     @property
     def value(self) -> float:
         return self.residuals - self.fitted
-
-    def __add__(self, other: Any) -> Redundancy:
-        return Redundancy(*(one + more for one, more in zip(self, other, strict=True)))
 
 
 def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
@@ -50,9 +49,9 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
         A keyframe is not determined.
     """
     names, linear = _linearized(estimate)
-    factors: dict[int, list[tuple[str, Any]]] = {}
     session, groups = _states(linear, estimate)
     place = {name: row for row, group in enumerate(groups) for name in group}
+    factors: dict[int, list[tuple[str, Any]]] = {}
     for i, name in enumerate(names):
         factor = linear.at(i)
         if factor is not None and not factor.empty():
@@ -61,13 +60,26 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     order = gtsam.Ordering()
     for state in [*(state for group in groups for state in group), *session]:
         order.push_back(state)
-    found: dict[str, Redundancy] = {}
+    total = {name: np.zeros(3) for name in names}
     for row, joint in joint_covariances(linear.eliminateSequential(order, gtsam.EliminateQR), groups, session):
-        for name, factor in factors.get(row, ()):
-            J, residual = factor.jacobian()
-            fitted = float(((J @ joint.of(factor.keys())) * J).sum())
-            found[name] = found.get(name, Redundancy()) + Redundancy(len(J), fitted, float(residual @ residual))
-    return found
+        _add_factors(total, factors.get(row, ()), joint)
+    return {name: Redundancy(int(count), *rest) for name, (count, *rest) in total.items() if count}
+
+
+def _add_factors(total: Mapping[str, Floats], factors: Sequence[tuple[str, Any]], joint: JointCovariance) -> None:
+    """Add residuals, fitted and square of some factors to those of their names (3,); joint : of all their states."""
+    parts = [factor.jacobian() for _, factor in factors]
+    ends = list(itertools.accumulate(len(residual) for _, residual in parts))
+    J = np.zeros((ends[-1] if ends else 0, len(joint.covariance)))
+    for (_, factor), (part, residual), end in zip(factors, parts, ends, strict=True):
+        column = 0
+        for state in factor.keys():  # noqa: SIM118
+            at = joint.at[state]
+            J[end - len(residual) : end, at] = part[:, column : column + at.stop - at.start]
+            column += at.stop - at.start
+    fitted = ((J @ joint.covariance) * J).sum(axis=1)
+    for (name, _), (_, residual), end in zip(factors, parts, ends, strict=True):
+        total[name] += len(residual), fitted[end - len(residual) : end].sum(), residual @ residual
 
 
 def _linearized(estimate: Estimate) -> tuple[list[str], Any]:
