@@ -196,7 +196,7 @@ def measure_recording(path: Path, *, with_pictures: bool) -> None:
         session = pictured(session, path.parent / "jpeg", count=2000)
     with tempfile.TemporaryDirectory() as folder:
         file, begin, cpu = Path(folder) / "run.rrd", time.perf_counter(), time.process_time()
-        write_recording(file, session=session, solution=run.solution, summary=run.summary, diagnostics=run.trace)
+        write_recording(file, session=session, solution=run.solution, summary=run.summary, diagnostics=run.diagnostics)
         cpu = time.process_time() - cpu
         detail = {"wall_s": round(time.perf_counter() - begin, 4), "size_mb": round(file.stat().st_size / 1e6, 2)}
     detail |= {"samples": len(session.require_imu()), "keyframes": len(run.solution)}

@@ -35,7 +35,7 @@ class RunConfig:
 
     vehicle : none, car, trolley or foot; empty takes the session's own
     sensors : names to use, or names with a leading minus to leave out; empty uses all
-    withhold : specifications of rows kept back and scored; start_s, end_s : stretch, seconds since time zero
+    withhold : specifications of rows withheld and scored; start_s, end_s : stretch, seconds since time zero
     initial : "e,n,u,heading_deg[,sigma_m,sigma_deg]"; rate : ``keyframes`` (and images), ``imu`` or a frequency in Hz
     passes : most solves of a batch run
     """

@@ -50,7 +50,7 @@ class Notes:
             self.dropped.setdefault(name, {})[reason] = count
 
 
-Step = Callable[[Session, Notes], Session]
+PreparationStep = Callable[[Session, Notes], Session]
 
 
 def choose_span(session: Session, notes: Notes) -> Session:
@@ -179,7 +179,7 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     return session
 
 
-PREPARE: Mapping[str, Step] = {
+PREPARE: Mapping[str, PreparationStep] = {
     "span": choose_span,
     "gaps": find_imu_gaps,
     "health": check_health,

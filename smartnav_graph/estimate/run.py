@@ -46,7 +46,7 @@ class Run:
     causal: Solution | None = None
     withheld: Mapping[str, Withheld] = field(default_factory=dict)
     causal_windows: Sequence[Window] = ()
-    trace: Diagnostics | None = None
+    diagnostics: Diagnostics | None = None
     estimate: Estimate | None = None
     pass_state: PassState = field(default_factory=PassState)
 
@@ -114,9 +114,16 @@ def _finish(
     solution = resample(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)
-    trace = Diagnostics.of(problem, estimate, solved.pass_state, updates)
+    diagnostics = Diagnostics.of(problem, estimate, solved.pass_state, updates)
     return Run(
-        problem, solution, summary, causal, withheld, trace=trace, estimate=estimate, pass_state=solved.pass_state
+        problem,
+        solution,
+        summary,
+        causal,
+        withheld,
+        diagnostics=diagnostics,
+        estimate=estimate,
+        pass_state=solved.pass_state,
     )
 
 

@@ -171,7 +171,7 @@ def fit_alignment(method: str, estimate: Floats, truth: Floats) -> FrameAlignmen
     Raises
     ------
     SessionError
-        Unknown method, or positions that do not determine the rotation (standing still, or along a line).
+        Unknown method, or positions that do not determine the rotation (no motion, or along a line).
     """
     if method == "none":
         return FrameAlignment(np.eye(3), np.zeros(3))

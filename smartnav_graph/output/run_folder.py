@@ -227,7 +227,7 @@ def _write_views(
     from smartnav_graph.output.report import report_markdown, write_report
     from smartnav_graph.output.rerun_log import write_latency, write_recording
 
-    session, updates = recorded(run), None if run.trace is None else run.trace.updates
+    session, updates = recorded(run), None if run.diagnostics is None else run.diagnostics.updates
     if views["recording"]:
         progress("writing the recording", 0, 0)
         # a summary without its timings: equal runs give equal recordings
@@ -239,11 +239,11 @@ def _write_views(
             summary=summary,
             evaluation=evaluation,
             causal=run.causal,
-            diagnostics=run.trace,
+            diagnostics=run.diagnostics,
             report_markdown=report_markdown(steady, evaluation),
         )
-        if run.trace is not None and updates is not None:
-            write_latency(folder / "latency.rrd", session=run.session, diagnostics=run.trace, identity=identity)
+        if run.diagnostics is not None and updates is not None:
+            write_latency(folder / "latency.rrd", session=run.session, diagnostics=run.diagnostics, identity=identity)
     if views["report"]:
         progress("writing the report", 0, 0)
         write_report(

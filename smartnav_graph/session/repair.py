@@ -55,8 +55,8 @@ def repair(kind: type[Stream], table: Mapping[str, Column], names: Iterable[str]
     return rows, counts
 
 
-def _keep(rows: Table, chosen: Mask | Indices) -> Table:
-    return {name: np.asarray(column)[chosen] for name, column in rows.items()}
+def _keep(rows: Table, selected: Mask | Indices) -> Table:
+    return {name: np.asarray(column)[selected] for name, column in rows.items()}
 
 
 def _drop_nan(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:

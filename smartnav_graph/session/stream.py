@@ -127,8 +127,8 @@ class Stream:
     def take(self, rows: Mask | Indices | slice) -> Self:
         """The same stream with only these rows (mask, indices or slice)."""
         values = {f.name: getattr(self, f.name) for f in self.specs()}
-        chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
-        return type(self)(**chosen, extra={name: value[rows] for name, value in self.extra.items()})
+        selected: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
+        return type(self)(**selected, extra={name: value[rows] for name, value in self.extra.items()})
 
     def columns(self) -> Table:
         """File columns, in order; the inverse of `from_columns`."""

@@ -39,14 +39,14 @@ class Box:
 @dataclass(frozen=True)
 class Scene:
     """Faces with `corner`, `u`, `v` (f, 3) m; `points` (n, 3) m on the faces numbered `face` (n,), which are visible up
-    to a distance of `reach` (n,) m."""
+    to a distance of `visible_m` (n,) m."""
 
     corner: Floats
     u: Floats
     v: Floats
     points: Floats
     face: Indices
-    reach: Floats
+    visible_m: Floats
 
     @cached_property
     def normal(self) -> Floats:
@@ -55,10 +55,10 @@ class Scene:
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
     def near(self, centre: Floats, range_m: float) -> Indices:
-        """Points within `range_m`, and within their reach, of a place (3,), in their order."""
+        """Points within `range_m`, and within their visible_m, of a place (3,), in their order."""
         rows = np.flatnonzero(np.abs(self._east - centre[0]) < range_m)
         away = self.points[rows] - centre
-        return np.asarray(rows[np.einsum("ni,ni->n", away, away) < np.minimum(self.reach[rows], range_m) ** 2])
+        return np.asarray(rows[np.einsum("ni,ni->n", away, away) < np.minimum(self.visible_m[rows], range_m) ** 2])
 
     @cached_property
     def _east(self) -> Floats:
@@ -94,10 +94,10 @@ def make_scene(boxes: Sequence[Box], per_m2: float, rng: np.random.Generator) ->
     area = np.linalg.norm(np.cross(u, v), axis=1)
     face = np.repeat(np.arange(len(area)), rng.poisson(per_m2 * area))
     a, b = rng.random((2, len(face), 1))
-    reach = _NEAR_M / np.maximum(rng.random(len(face)), _NEAR_M / _FAR_M)
-    scene = Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face, reach)
+    visible_m = _NEAR_M / np.maximum(rng.random(len(face)), _NEAR_M / _FAR_M)
+    scene = Scene(corner, u, v, corner[face] + a * u[face] + b * v[face], face, visible_m)
     free = _free(scene.points + _CLEAR_M * scene.normal[face], boxes)
-    return Scene(corner, u, v, scene.points[free], face[free], reach[free])
+    return Scene(corner, u, v, scene.points[free], face[free], visible_m[free])
 
 
 def _free(points: Floats, boxes: Sequence[Box]) -> Mask:

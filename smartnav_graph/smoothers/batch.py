@@ -175,7 +175,7 @@ class Batch:
 
     def _order(self, stretch: Sequence[GraphUpdate]) -> gtsam.Ordering:
         """Keyframes of a stretch, then the session states that its factors touch: not those of its first step, which
-        the anchor stands for."""
+        the anchor replaces."""
         order, touched = gtsam.Ordering(), stretch if stretch[0] is self.steps[0] else stretch[1:]
         for name in [name for step in stretch for name in step.names()] + list(session_states(touched)):
             order.push_back(name)

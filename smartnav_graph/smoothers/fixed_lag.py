@@ -55,7 +55,7 @@ class FixedLag(Incremental):
         self._weak = True
 
     def _take(self, update: GraphUpdate) -> None:
-        self._make_room(update)
+        self._marginalise_oldest(update)
         self._drop_late(update)
         self._insert(update)
         graph = WholeGraph((f for _, f in self._factors), (b for _, b in self._blocks), self._held)
@@ -97,7 +97,7 @@ class FixedLag(Incremental):
             kept.append(block)
         update.blocks = kept
 
-    def _make_room(self, update: GraphUpdate) -> None:
+    def _marginalise_oldest(self, update: GraphUpdate) -> None:
         """Marginalise the keyframes that are older than the lag, and keep their last estimate."""
         leaving = []
         while self._inside and self._inside[0].t_s < update.t_s - self.config.lag_s:

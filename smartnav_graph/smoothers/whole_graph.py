@@ -14,7 +14,7 @@ from smartnav_graph.graph.robust import loss_weights, robust
 from smartnav_graph.graph.states import STATES, SessionState
 from smartnav_graph.graph.update import FactorBatch, GraphUpdate, Measured, RowModel
 
-Held = Mapping[int, Floats]
+FixedStates = Mapping[int, Floats]
 
 
 def value_of(values: gtsam.Values, letter: str, name: int) -> Floats:
@@ -30,7 +30,7 @@ class Snapshot:
     """States of gtsam.Values as arrays, each fetched once; held states at their constants. What stacks are
     linearised to there is kept: a candidate whose cost was found is what the next step is taken from."""
 
-    def __init__(self, values: gtsam.Values, held: Held) -> None:
+    def __init__(self, values: gtsam.Values, held: FixedStates) -> None:
         self.values = values
         self._found: dict[int, Floats] = dict(held)
         self._linear: dict[int, tuple[Floats, list[Floats]]] = {}
@@ -52,7 +52,7 @@ class Snapshot:
 class StackedFactors:
     """All rows of one model under one loss; `blocks` gives each row's origin."""
 
-    def __init__(self, model: RowModel, blocks: Sequence[FactorBatch], held: Held) -> None:
+    def __init__(self, model: RowModel, blocks: Sequence[FactorBatch], held: FixedStates) -> None:
         self.model, self.blocks, self.held = model, blocks, held
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
@@ -130,7 +130,7 @@ def linear_factor(keys: Sequence[int], dims: Sequence[int], augmented: Floats) -
     return gtsam.GaussianConditional(keys, 1, gtsam.VerticalBlockMatrix(dims, augmented))
 
 
-def stacks_of(blocks: Iterable[FactorBatch], held: Held) -> list[StackedFactors]:
+def stacks_of(blocks: Iterable[FactorBatch], held: FixedStates) -> list[StackedFactors]:
     """Blocks joined by sensor, model, loss and which of their states are held."""
     groups: dict[tuple[str, int, str, tuple[bool, ...]], list[FactorBatch]] = {}
     for block in blocks:
@@ -143,7 +143,9 @@ def stacks_of(blocks: Iterable[FactorBatch], held: Held) -> list[StackedFactors]
 class WholeGraph:
     """What `minimise` needs of a graph: `linearize` and `error`."""
 
-    def __init__(self, factors: Iterable[gtsam.NonlinearFactor], blocks: Iterable[FactorBatch], held: Held) -> None:
+    def __init__(
+        self, factors: Iterable[gtsam.NonlinearFactor], blocks: Iterable[FactorBatch], held: FixedStates
+    ) -> None:
         self.native = gtsam.NonlinearFactorGraph()
         for factor in factors:
             self.native.push_back(factor)
@@ -191,7 +193,7 @@ def session_prior(state: SessionState) -> gtsam.PriorFactorVector:
 _SIZES: dict[RowModel, int] = {}
 
 
-def custom_factor(block: FactorBatch, row: int, held: Held) -> gtsam.CustomFactor:
+def custom_factor(block: FactorBatch, row: int, held: FixedStates) -> gtsam.CustomFactor:
     """One row of a block as a gtsam.CustomFactor on the states that are not held."""
     model, keys, data = block.model, block.keys[row], block.data[row : row + 1]
     free = [i for i, k in enumerate(keys) if k not in held]

@@ -13,7 +13,7 @@ class FrontEndReport:
     pictures : of the session; thinned : left out to keep the rate; used : the rest without the skipped, which are
     counted by reason, `first` naming a file of each; longest_break_s : between used pictures
     pairs, empty_pairs (without a match), matches, median_matches of a pair; tracks, median_track_length in pictures,
-    lost_at_once (corners never found again), blind (steps that the gyroscope did not predict)
+    lost_at_once (corners not found again), blind (steps that the gyroscope did not predict)
     ms_picture, ms_pair : processor time of points and descriptors, and of matching; seconds : total
     """
 
@@ -52,7 +52,7 @@ class FrontEndReport:
         if self.tracks:
             lines += [
                 f"tracks: {self.tracks}, median length {self.median_track_length:g} pictures; "
-                f"{self.lost_at_once} corners never found again; {self.blind} steps without a gyroscope",
+                f"{self.lost_at_once} corners not found again; {self.blind} steps without a gyroscope",
                 f"time: {self.ms_picture:.1f} ms a picture",
             ]
         if self.pairs:

@@ -56,7 +56,7 @@ def test_the_camera_sees_what_projection_by_hand_says():
     nav_R_body, p = truth.nav_R_body[0], truth.nav_t_body[0]
     body_point = np.array([1.0, 2.0, 0.5]) + model.mount.body_t
     alone = replace(
-        scene, points=(p + nav_R_body @ body_point)[None], face=np.zeros(1, dtype=int), reach=np.array([9.0])
+        scene, points=(p + nav_R_body @ body_point)[None], face=np.zeros(1, dtype=int), visible_m=np.array([9.0])
     )
     alone = replace(
         alone, corner=p[None] + nav_R_body @ [0, 9.0, 0], u=nav_R_body[None, :, 0], v=nav_R_body[None, :, 2]

@@ -95,7 +95,7 @@ def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
     assert metres < clean[0] + 0.02 and degrees < clean[1] + 0.1
     builder = next(b for b in run.problem.builders if b.name == "image_pairs")
     touched = (builder.seen.t_ns[builder.seen.images] == one).any(axis=1)
-    assert touched.sum() == 8 and not (run.trace.pairs.verdict[touched] == IN_USE).any()
+    assert touched.sum() == 8 and not (run.diagnostics.pairs.verdict[touched] == IN_USE).any()
 
 
 def test_images_of_something_else_are_refused(room):

@@ -234,7 +234,7 @@ class FirstStretch:
         return replace(prior, **sigmas)
 
     def levelled_prior(self, heading_deg: float, p: Floats, sigma_m: float, sigma_deg: float) -> PriorBuilder:
-        """A prior that holds the start: levelled by the accelerometer, position and heading as given."""
+        """A prior that holds the start: levelled by the accelerometer, position and heading of the user."""
         return self.prior(
             self.state(self.nav_R_body(heading_deg), p, np.zeros(3)),
             attitude=None,

@@ -232,7 +232,7 @@ class _Stretch:
         problem = AlignmentProblem(curve.at(rows), self.fixes, t, known.fix_sigma, known.gravity, known.bias_mean)
         return [problem.agree(*start) for start in starts]
 
-    def first_seconds(self) -> _Stretch | None:
+    def initial_part(self) -> _Stretch | None:
         """The part in which even a bad rate turns the curve little; None where it holds too few fixes."""
         ends = np.array([w.t1_ns for w in self.windows])
         until = max(int(self.t_ns[0]), int(ends[0])) + round(SHORT_S * NS)
@@ -277,7 +277,7 @@ def _far(bias: Floats, points: Sequence[Floats]) -> bool:
 
 def _first_bias(stretch: _Stretch, starts: Sequence[Start]) -> Floats:
     """Biases (6,) by the first seconds."""
-    bias, short = stretch.known.bias_mean, stretch.first_seconds()
+    bias, short = stretch.known.bias_mean, stretch.initial_part()
     if short is None:
         return bias
     for _ in range(ROUNDS):
@@ -290,12 +290,12 @@ def _first_bias(stretch: _Stretch, starts: Sequence[Start]) -> Floats:
 
 def distinct(states: Sequence[Alignment]) -> list[Alignment]:
     """The different ones of these states, cheapest first."""
-    chosen: list[Alignment] = []
+    selected: list[Alignment] = []
     for state in sorted(states, key=lambda s: s.cost):
         alike = (
             np.array_equal(state.outside, other.outside) and np.trace(state.R.T @ other.R) > 1 + 2 * np.cos(ALIKE)
-            for other in chosen
+            for other in selected
         )
         if not any(alike):
-            chosen.append(state)
-    return chosen
+            selected.append(state)
+    return selected

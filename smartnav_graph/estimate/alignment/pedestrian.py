@@ -128,7 +128,7 @@ def _least(cost: Callable[[float], float], sigma: float) -> float:
 
 
 def _tracked(windows: Sequence[Window], steps: Steps, body_R_vehicle: Floats) -> _Track:
-    """Gyroscope integrated, the attitude pulled towards the mean force at the end of every window."""
+    """Gyroscope integrated, the attitude corrected towards the mean force at the end of every window."""
     R = _level(windows)
     stamps, attitudes, ends = [np.array([windows[0].t1_ns])], [R[None]], [0]
     for window in windows[1:]:

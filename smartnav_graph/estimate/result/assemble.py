@@ -245,7 +245,7 @@ def _image_times(problem: Problem) -> NDArray[np.int64]:
 
 
 def used_counts(problem: Problem, pass_state: PassState) -> Mapping[str, int]:
-    """Rows of every absolute sensor that the solution rests on."""
+    """Rows in use of every absolute sensor."""
     counts = {}
     for name in (builder.name for builder in problem.builders if builder.name in ABSOLUTE):
         there = sum(len(w.rows.get(name, ())) + len(w.delayed.get(name, ())) for w in problem.windows)

@@ -17,7 +17,7 @@ from smartnav_graph.graph.robust import expected_weighted_square
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
 
-# Redundancy below which a sum of squares tells nothing of a sensor's noise.
+# Redundancy below which a sum of squares has no information on a sensor's noise.
 LEAST_REDUNDANCY = 1.0
 # Factors that stand for many measurements, matches or observations of tracks, each of which has a residual. Those in
 # use are inside their gate and count in full: under their loss the sum would be too small.

@@ -228,7 +228,7 @@ def _row_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, A
 
 
 def _standstills(problem: Problem) -> dict[str, Any]:
-    """How often and how long the device stood still in the stretch that was solved; how much of it truly at rest."""
+    """Number and duration of the standstills in the solved time span, and how much of it is completely at rest."""
     rests = problem.rests
     if rests is None:
         return {}

@@ -1,8 +1,8 @@
 """Which image pairs, and which of their matches, an estimate believes: pass by pass until they are settled.
 
 First by the rotation of the inertial data (two matches give the baseline); then at the smoothed states; then once more,
-whereupon pairs are compressed. Where too few pairs agree with the solution without images, that is too poor to judge
-them, and none is used.
+whereupon pairs are compressed. Where too few pairs agree with the solution without images, that is too inaccurate to
+test them, and none is used.
 """
 
 from __future__ import annotations

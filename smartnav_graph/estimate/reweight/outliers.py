@@ -85,14 +85,14 @@ def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
 @dataclass(frozen=True)
 class Verdict:
     """Residuals of one sensor at the estimate: rows (m,), normalised squares (m,), and the largest square of good
-    ones by the level of all and a probability; graduated: whether its loss is to be truncated by and by."""
+    ones by the level of all and a probability; gnc: whether graduated non-convexity truncates its loss."""
 
     name: str
     rows: NDArray[np.intp]
     square: Floats
     dim: int
     limit: Callable[[float, float | None], Floats]
-    graduated: bool = False
+    gnc: bool = False
 
     def outside(self, probability: float | None = None) -> frozenset[int]:
         """Rows beyond the gate, at the robust level of all rows."""

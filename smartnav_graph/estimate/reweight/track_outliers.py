@@ -103,7 +103,7 @@ class _Views(NamedTuple):
 def _views(builder: SmartBuilder, selection: TrackSelection, estimate: Estimate) -> _Views:
     seen, stamps = builder.sightings, builder.image_ns
     place, known = estimate.keyframes_at(stamps, builder.merge_ns)
-    known[1:] &= place[1:] != place[:-1]  # a keyframe stands for one image
+    known[1:] &= place[1:] != place[:-1]  # one image a keyframe
     R, p, v, bias = (x[place][seen.image.ravel()] for x in estimate.states())
     delay = estimate.offset_s(STREAM) + builder.camera_model.delay(seen.xy.reshape(-1, 2))
     turn = builder.rates.turn(stamps[seen.image.ravel()], delay) - bias[:, 3:] * delay[:, None]

@@ -1,6 +1,6 @@
 """What one pass leaves to the next: which fixes to reject, and the noise of the sensors.
 
-Rejection: least squares first; where residuals stand out, a Cauchy pass finds the outliers, a chi-square gate decides,
+Rejection: least squares first; where residuals are large, a Cauchy pass finds the outliers, a chi-square gate decides,
 and rows inside the gate are let in again. A redescending loss ignores what lies far beyond its sigma, and the
 position at a fix of centimetres is predicted to metres: so the loss is as wide as that first, and narrowed pass by
 pass. Where configured, truncated least squares by graduated non-convexity comes between the two, started from the
@@ -46,7 +46,7 @@ LEAST_REDUNDANCY = 10.0
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
-# rest on few degrees of freedom and creep.
+# have few degrees of freedom and change slowly.
 STEADY = 0.1
 STEADY_INERTIAL = 0.1
 
@@ -66,7 +66,7 @@ def update_pass_state(
     builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, pass_state: PassState
 ) -> tuple[PassState, bool]:
     """The pass state of the next pass, and whether nothing changed."""
-    new, done = _revised(builders, windows, estimate, pass_state)
+    new, done = _update_noise_and_fixes(builders, windows, estimate, pass_state)
     if new.stage < LAST_STAGE:
         return new, done
     tested = check_pairs(builders, estimate, new)
@@ -74,7 +74,7 @@ def update_pass_state(
     return tested, done and tested is new
 
 
-def _revised(
+def _update_noise_and_fixes(
     builders: Sequence[Builder], windows: Sequence[Window], estimate: Estimate, pass_state: PassState
 ) -> tuple[PassState, bool]:
     """The same by fixes and inertial data alone."""
@@ -90,7 +90,7 @@ def _revised(
         return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
     outliers = {v.name: v.outside() for v in tested}
     if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
-        weighed = _graduated(tested, pass_state)
+        weighed = _next_gnc(tested, pass_state)
         if weighed is not None:
             return replace(weighed, noise_scales=new.noise_scales), False
         return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
@@ -121,9 +121,9 @@ def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals
     return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
 
 
-def _graduated(tested: Sequence[Verdict], pass_state: PassState) -> PassState | None:
+def _next_gnc(tested: Sequence[Verdict], pass_state: PassState) -> PassState | None:
     """The pass state with the weights of the next mu; None where every weight is 0 or 1, or GNC is not configured."""
-    asked = [v for v in tested if v.graduated]
+    asked = [v for v in tested if v.gnc]
     if not asked:
         return None
     squares = {v.name: v.relative() for v in asked}
@@ -135,15 +135,15 @@ def _graduated(tested: Sequence[Verdict], pass_state: PassState) -> PassState | 
     if all(gnc.converged(weight) for weight in found.values()):
         return None
     weights = {v.name: dict(zip(v.rows.tolist(), found[v.name].tolist(), strict=True)) for v in asked}
-    rejected = {v.name: v.outside() for v in tested if not v.graduated}
+    rejected = {v.name: v.outside() for v in tested if not v.gnc}
     return replace(pass_state, phase=Phase.GRADUATED, rejected=rejected, weights=weights, gnc_mu=mu)
 
 
 def extra_passes(builders: Iterable[Builder]) -> int:
-    """Passes that a graduated loss, and tracks that follow on image pairs, need beyond those of the others."""
+    """Passes that graduated non-convexity, and tracks that follow on image pairs, need beyond those of the others."""
     builders = list(builders)
-    graduated_too = any(b.config.loss == "gnc" for b in position_builders(builders))
-    return GRADUATED_PASSES * graduated_too + ROUNDS * (one_of(builders, SmartBuilder) is not None)
+    also_gnc = any(b.config.loss == "gnc" for b in position_builders(builders))
+    return GRADUATED_PASSES * also_gnc + ROUNDS * (one_of(builders, SmartBuilder) is not None)
 
 
 def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:

@@ -1,4 +1,4 @@
-"""Influence of all measurements on one keyframe: shares of its variance, pulls, and its sigma without a source."""
+"""Influence of all measurements on one keyframe: shares of its variance, shifts, and its sigma without a source."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ RIDGE = 1e-13
 @dataclass(frozen=True)
 class Measurements:
     """Every factor of the graph: source (f,), t_ns (f,), row (f,), share (f, 15) of the variance of the keyframe and
-    pull (f, 15) in sigmas."""
+    shift (f, 15) in sigmas."""
 
     source: NDArray[np.object_]
     t_ns: Times
     row: NDArray[np.int64]
     share: Floats
-    pull: Floats
+    shift: Floats
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class KeyframeInfluence:
 
     place : row among the keyframes; covariance (15, 15) given all data
     sources : names of the s builders of the whole graph, and `CALIBRATION`
-    share (s, 15) : of each component's variance, by source; here (s, 15) : its part from factors that touch this
+    share (s, 15) : of each component's variance, by source; at_keyframe (s, 15) : its part from factors that touch this
     keyframe and no other
-    pull (s, 15) : how far each source shifts the state against the others, in sigmas; touching (s,) : number of factors
-    that touch the keyframe; pull_here (s, 15) : their part of the pull; own (s, 15) : sigma of a component from these
-    factors alone if all else were known, inf without information
+    shift (s, 15) : how far each source moves the state against the others, in sigmas; touching (s,) : number of factors
+    that touch the keyframe; shift_at_keyframe (s, 15) : their part of the shift; own (s, 15) : sigma of a component
+    from these factors alone if all else were known, inf without information
     without (s, 15) : sigma without the source over sigma, inf beyond `LOST`
     """
 
@@ -53,10 +53,10 @@ class KeyframeInfluence:
     covariance: Floats
     sources: Sequence[str]
     share: Floats
-    here: Floats
-    pull: Floats
+    at_keyframe: Floats
+    shift: Floats
     touching: NDArray[np.int64]
-    pull_here: Floats
+    shift_at_keyframe: Floats
     own: Floats
     without: Floats
     measurements: Measurements
@@ -68,7 +68,7 @@ class KeyframeInfluence:
 
 
 def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence:
-    """Shares, pulls and sigmas without a source of the keyframe in row `place`.
+    """Shares, shifts and sigmas without a source of the keyframe in row `place`.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
     sigma, by_source, own = np.sqrt(variance), system.by_source, system.J[:, columns] @ turn.T
     without = np.array([system.sigma_without(s, columns, turn) for s in range(len(influence.sources))]) / sigma
     K = np.asarray(system.J @ covariances @ turn.T)
-    pull = K * system.b[:, None] / sigma
+    shift = K * system.b[:, None] / sigma
     touching, alone = (mask[system.factor][:, None] for mask in system.touching(index))
     with np.errstate(divide="ignore"):
         own_sigma = 1.0 / np.sqrt(by_source @ own**2)
@@ -93,10 +93,10 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
         covariance=covariance,
         sources=influence.sources,
         share=by_source @ K**2 / variance,
-        here=by_source @ (K**2 * alone) / variance,
-        pull=by_source @ pull,
+        at_keyframe=by_source @ (K**2 * alone) / variance,
+        shift=by_source @ shift,
         touching=np.bincount(system.source[system.touching(index)[0]], minlength=len(influence.sources)),
-        pull_here=by_source @ (pull * touching),
+        shift_at_keyframe=by_source @ (shift * touching),
         own=own_sigma,
         without=np.where(without > LOST, np.inf, without),
         measurements=Measurements(
@@ -104,7 +104,7 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
             t_ns=np.concatenate([group.t_ns for group in influence.groups]),
             row=np.concatenate([group.row for group in influence.groups]),
             share=system.by_factor @ K**2 / variance,
-            pull=system.by_factor @ pull,
+            shift=system.by_factor @ shift,
         ),
     )
 
@@ -172,9 +172,9 @@ class _LinearSystem:
         for group in self.groups:
             kind = letters_of(group.keys)
             shared = np.isin(kind, [ord(letter) for letter, state in STATES.items() if state.scope == "session"])
-            here = ~shared & (indices_of(group.keys) == index)
-            touches.append((here & np.isin(kind, [ord(letter) for letter in KEYFRAME_LETTERS])).any(axis=1))
-            alone.append((here | shared).all(axis=1))
+            at_keyframe = ~shared & (indices_of(group.keys) == index)
+            touches.append((at_keyframe & np.isin(kind, [ord(letter) for letter in KEYFRAME_LETTERS])).any(axis=1))
+            alone.append((at_keyframe | shared).all(axis=1))
         touched = np.concatenate(touches)
         return touched, touched & np.concatenate(alone)
 

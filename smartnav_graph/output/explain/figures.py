@@ -73,7 +73,7 @@ class Explanation:
             "keyframe": {"number": place + 1, "of": len(frames), "window": str(frames.kind[place])},
             "components": [self._component(quantity) for quantity in QUANTITIES],
             "shift_sigmas": {
-                name: shifts(shift) for name, shift in zip(self.keyframe.sources, self.keyframe.pull, strict=True)
+                name: shifts(shift) for name, shift in zip(self.keyframe.sources, self.keyframe.shift, strict=True)
             },
             "balanced": self.balanced,
             "touching": self._touching(),
@@ -88,7 +88,7 @@ class Explanation:
     @property
     def balanced(self) -> bool:
         """Whether the shifts add up to zero: the graph was solved as a whole."""
-        return bool(np.abs(self.keyframe.pull.sum(axis=0)).max() < UNBALANCED)
+        return bool(np.abs(self.keyframe.shift.sum(axis=0)).max() < UNBALANCED)
 
     def share(self, quantity: Quantity) -> Floats:
         """Share (s,) of each source in the variance of a quantity."""
@@ -96,7 +96,7 @@ class Explanation:
 
     def measured_at_epoch(self, quantity: Quantity) -> float:
         """Share of the factors that touch this keyframe and no other."""
-        return float(self._mean(self.keyframe.here, quantity).sum())
+        return float(self._mean(self.keyframe.at_keyframe, quantity).sum())
 
     def _mean(self, by_component: Floats, quantity: Quantity) -> Floats:
         part, variance = quantity.components, self.keyframe.sigma[quantity.components] ** 2
@@ -122,7 +122,7 @@ class Explanation:
     def strongest(self) -> list[int]:
         """Measurements that shift the position or the heading most, without the inertial ones."""
         all_rows = self.keyframe.measurements
-        shift = np.abs(all_rows.pull[:, [3, 4, 5, YAW]]).max(axis=1)
+        shift = np.abs(all_rows.shift[:, [3, 4, 5, YAW]]).max(axis=1)
         shift[np.isin(all_rows.source, NO_ROWS)] = 0.0
         order = np.argsort(-shift, kind="stable")[:STRONGEST]
         return [int(i) for i in order if shift[i] > 0.0]
@@ -144,7 +144,11 @@ class Explanation:
         h = self.keyframe
         for i in np.flatnonzero(h.touching).tolist():
             own = {q.name: float(np.linalg.norm(h.own[i, q.components])) * q.factor for q in QUANTITIES}
-            row = {"source": h.sources[i], "factors": int(h.touching[i]), "shift_sigmas": shifts(h.pull_here[i])}
+            row = {
+                "source": h.sources[i],
+                "factors": int(h.touching[i]),
+                "shift_sigmas": shifts(h.shift_at_keyframe[i]),
+            }
             found.append(row | {"sigma_if_neighbours_were_known": {n: finite(s) for n, s in own.items()}})
         return found
 
@@ -156,7 +160,7 @@ class Explanation:
             "row": int(m.row[i]),
             "share_of_position": float(self._mean(m.share[i : i + 1], POSITION)[0]),
             "share_of_heading": float(m.share[i, YAW]),
-            "shift_sigmas": shifts(m.pull[i]),
+            "shift_sigmas": shifts(m.shift[i]),
         }
 
 

@@ -67,7 +67,7 @@ def _shift_lines(found: Explanation) -> list[str]:
     sides = "".join(f"{name:>10}" for name in ("east", "north", "up", "clockwise"))
     lines = ["", f"{'shift in sigmas':<18}{sides}   {'at keyframe':>11}{sides}"]
     h = found.keyframe
-    for source, shift, count, near in zip(h.sources, h.pull, h.touching, h.pull_here, strict=True):
+    for source, shift, count, near in zip(h.sources, h.shift, h.touching, h.shift_at_keyframe, strict=True):
         by_all, by_these = (
             "".join(f"{round(x, 2) + 0.0:>+10.2f}" for x in shifts(part).values()) for part in (shift, near)
         )
@@ -155,20 +155,20 @@ def _shifted(found: Explanation) -> Iterator[str]:
         yield "This replay has no final batch solution of all states together: shifts are not available."
         return
     h, m = found.keyframe, found.keyframe.measurements
-    sources = [i for i, source in enumerate(h.sources) if source not in NO_ROWS and _significant(h.pull[i])]
+    sources = [i for i, source in enumerate(h.sources) if source not in NO_ROWS and _significant(h.shift[i])]
     if sources:
-        most = max(sources, key=lambda i: float(np.abs(h.pull[i, 2:6]).max()))
+        most = max(sources, key=lambda i: float(np.abs(h.shift[i, 2:6]).max()))
         yield (
-            f"Source with the largest effect: {title_of(h.sources[most])}; it {_shift(found, h.pull[most])}; the other "
-            "sources balance this."
+            f"Source with the largest effect: {title_of(h.sources[most])}; it {_shift(found, h.shift[most])}; the "
+            "other sources balance this."
         )
-    single = [i for i in found.strongest() if _significant(m.pull[i])]
+    single = [i for i in found.strongest() if _significant(m.shift[i])]
     if not single:
         yield f"No single measurement shifts the estimate by {SMALL_SHIFT} sigma."
         return
     source, when = title_of(str(m.source[single[0]])), found.seconds(int(m.t_ns[single[0]]))
     yield (
-        f"Single measurement with the largest effect: {source} at {when:.2f} s; it {_shift(found, m.pull[single[0]])}."
+        f"Single measurement with the largest effect: {source} at {when:.2f} s; it {_shift(found, m.shift[single[0]])}."
     )
 
 

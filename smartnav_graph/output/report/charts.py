@@ -45,7 +45,7 @@ def figure(plots: Sequence[Plot], entries: Sequence[tuple[str, str]] = (), note:
 
 
 def grid(figures: Sequence[str]) -> str:
-    """Small figures side by side where there is room."""
+    """Small figures side by side on a wide page."""
     return f'<div class="grid">{"".join(figures)}</div>'
 
 

@@ -92,7 +92,7 @@ def axis(values: ArrayLike, *, count: int = 5, include: Iterable[float] = (), le
 
 
 def exact_axis(lo: float, hi: float, *, count: int = 6, step: float | None = None) -> Axis:
-    """Linear axis from `lo` to `hi` as given; round ticks inside."""
+    """Linear axis from `lo` to `hi`; round ticks inside."""
     hi = hi if hi > lo else lo + 1.0
     return ticked(lo, hi, step or round_step(hi - lo, count))
 

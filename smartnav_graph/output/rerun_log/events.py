@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.timebase import NS, Gap, find_gaps, nearest, ns_from_seconds
 from smartnav_graph.graph.solution import Residuals, Solution
-from smartnav_graph.output import summary_json
-from smartnav_graph.output.summary_json import GAP_KINDS, Summary, standstill_spans
+from smartnav_graph.output.summary_json import GAP_KINDS, Summary, imu_gaps, standstill_spans
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
@@ -72,7 +71,7 @@ def span(session: Session, solution: Solution | None) -> tuple[int, int]:
 def gap_spans(session: Session, summary: Summary) -> list[Gap]:
     """IMU data gaps of the summary, else those found in the inertial stream."""
     if "gaps" in summary:
-        gaps = summary_json.imu_gaps(summary)
+        gaps = imu_gaps(summary)
         starts = ns_from_seconds([gap.start_s for gap in gaps]) + session.t0_ns
         found = [
             Gap(int(t), int(t + ns_from_seconds(gap.length_s)), gap.kind) for t, gap in zip(starts, gaps, strict=True)

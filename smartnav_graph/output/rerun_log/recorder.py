@@ -37,7 +37,7 @@ _YEAR_2000_NS = int(np.datetime64("2000-01-01", "ns").astype(np.int64))
 
 
 def utc_from_gps(t_ns: Times) -> Times:
-    """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds taken off."""
+    """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds subtracted."""
     steps = np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64) + np.arange(1, len(_LEAP_DAYS) + 1) * 10**9
     continuous = np.asarray(t_ns, dtype=np.int64) + _GPS_EPOCH_NS
     return np.asarray(continuous - np.searchsorted(steps, continuous, side="right") * 10**9)

@@ -32,7 +32,7 @@ class Blocks:
     of: Indices
 
     @classmethod
-    def cut(cls, imu: Imu, gaps: Sequence[Gap], gravity: float) -> Blocks:
+    def of_samples(cls, imu: Imu, gaps: Sequence[Gap], gravity: float) -> Blocks:
         """The blocks of a recording; gravity in m/s^2."""
         of = (imu.t_ns - imu.t_ns[0]) // round(BLOCK_S * NS)
         used, starts, count = np.unique(of, return_index=True, return_counts=True)

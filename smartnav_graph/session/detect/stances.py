@@ -1,7 +1,7 @@
-"""The stances of a foot-mounted IMU: is the device on a foot, and when does the foot stand?
+"""The stances of a foot-mounted IMU: is the device on a foot, and when is the foot on the ground?
 
-In each step a foot stands for some tenths of a second while it rolls from heel to toe. It is not at rest, but its
-velocity is a few centimetres a second. A statistic of a few samples, selected by name:
+In each step a foot is on the ground for some tenths of a second while it rolls from heel to toe. It is not at rest, but
+its velocity is a few centimetres a second. A statistic of a few samples, selected by name:
 
     SHOE  sum |a - g mean(a) / |mean(a)||^2 / sa^2 + |w|^2 / sw^2     stance hypothesis optimal detector (GLRT)
     ARE   sum |w|^2 / sw^2                                            angular rate energy
@@ -36,14 +36,14 @@ ABOVE, LOWEST, HIGHEST = 1.3, 4.2, 6.6
 SHORTEST_S = 0.03
 ARM = 0.03  # m from the point the foot turns about to the sensor
 # A foot swings faster (rad/s) and hits the ground harder (m/s^2 beside gravity) than what is carried; in between it
-# stands.
+# is at rest.
 SWING_RATE, IMPACT, STAND_RATE, STAND_FORCE, STRIDE_S, STAND_SHARE = 4.0, 15.0, 1.0, 2.0, 1.5, 0.08
 # Longest windows (s) of a foot-mounted IMU in and between stances.
 STANCE_SPACING_S, SWING_S = 0.1, 0.2
 
 
 def is_foot_mounted(blocks: Blocks, vehicle: str) -> bool:
-    """Whether the device is mounted on a walking foot: it swings, hits the ground hard, and stands in between.
+    """Whether the device is mounted on a walking foot: it swings, hits the ground hard, and is at rest in between.
 
     A property of the whole recording, like the vehicle; `StandstillConfig.mounting` declares it.
     """

@@ -30,7 +30,7 @@ MOUNTINGS = ("auto", "foot", "body")
 # Blocks in a window, blocks at its ends that are left out where it borders on motion, limits of the scatter of block
 # means (rad/s, m/s^2): wheels on the smoothest road turn a device by more, and a hand or a walking foot by far.
 REST_BLOCKS, REST_MARGIN, REST_RATE, REST_FORCE = 10, 2, 3e-3, 0.05
-# A foot at rest differs from a walking one by orders of magnitude; who stands on it shifts his weight.
+# A foot at rest differs from a walking one by orders of magnitude; under the weight of the body it moves a little.
 FOOT_BLOCKS, FOOT_MARGIN, FOOT_RATE = 7, 1, 12e-3
 # Factor on the noise of block means that the scatter of a window at rest stays below.
 NOISE_FACTOR = 1.35
@@ -38,7 +38,7 @@ NOISE_FACTOR = 1.35
 FORCE_ERROR, BIAS_SIGMAS = 1.0, 4.0
 # Turn of a device at rest between two keyframes, rad: at least, and as the time over which its scatter acts.
 LEAST_TURN, TURN_TIME = 2e-4, 0.1
-# A pedestrian who stands with the device in the hand: scatter of block means, speed (m/s) of the hand. Walking shakes
+# A pedestrian at rest with the device in the hand: scatter of block means, speed (m/s) of the hand. Walking shakes
 # by twice that.
 STAND_IN_HAND, HAND_SPEED = (0.12, 0.15), 0.1
 
@@ -48,7 +48,7 @@ class StandstillConfig:
     """Zero velocity at standstills, and zero angular rate where the device is at rest.
 
     use_listed : use the periods of static.parquet; detect : find standstills in the inertial data
-    standing : a pedestrian who stands with the device in the hand has zero velocity, within that of the hand; never on
+    standing : a pedestrian at rest with the device in the hand has zero velocity, within that of the hand; never on
     wheels
     detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (by the data)
     zupt, zaru : zero velocity, zero angular rate; flat_floor : all stances are on one level, to floor_sigma m
@@ -153,13 +153,13 @@ def find_standstills(
     ----------
     vehicle : none, car, trolley or foot: only on foot, or where nothing is known, can the device be foot-mounted
     noise : of the sensor, densities; gravity m/s^2
-    seen : periods in which a camera stood still
+    seen : periods in which a camera was at rest
     known_ns : end of the data that show whether the device is mounted on a foot; all of them by default
     """
     found = Standstills.none(imu.t_ns)
     if config.detect and len(imu) > 2:
-        blocks = Blocks.cut(imu, gaps, gravity)
-        known = blocks if known_ns is None else Blocks.cut(imu.take(imu.t_ns <= known_ns), gaps, gravity)
+        blocks = Blocks.of_samples(imu, gaps, gravity)
+        known = blocks if known_ns is None else Blocks.of_samples(imu.take(imu.t_ns <= known_ns), gaps, gravity)
         on_foot = config.mounting == "foot" or (config.mounting == "auto" and is_foot_mounted(known, vehicle))
         found = _rests(blocks, imu.t_ns, noise, gravity, on_foot)
         if config.standing and vehicle == "foot" and not on_foot:
@@ -204,7 +204,7 @@ def _rests(blocks: Blocks, t_ns: Times, noise: ImuNoise, gravity: float, on_foot
 
 
 def _hand_speed(blocks: Blocks) -> Floats:
-    """Sigma (n,) m/s of the hand of a pedestrian who stands; NaN elsewhere."""
+    """Sigma (n,) m/s of the hand of a pedestrian at rest; NaN elsewhere."""
     if len(blocks.whole) < REST_BLOCKS:
         return np.full(len(blocks.of), np.nan)
     found = _quiet_scatter(blocks, REST_BLOCKS, REST_MARGIN, *STAND_IN_HAND)

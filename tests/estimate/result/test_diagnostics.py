@@ -35,7 +35,7 @@ def replayed(session):
 
 def test_wiring_has_every_factor_in_use_with_the_states_it_touches(session):
     run = smooth(session, Config())
-    layout = run.trace.layout
+    layout = run.diagnostics.layout
     assert Counter(layout.sensor.tolist()) == run.summary["factors"]
     assert set(layout.letter) <= set(STATES)
     imu = np.flatnonzero(layout.sensor == "imu")
@@ -43,12 +43,12 @@ def test_wiring_has_every_factor_in_use_with_the_states_it_touches(session):
         touched = layout.factor == factor
         got = sorted(zip(layout.letter[touched].tolist(), layout.index[touched].tolist(), strict=True))
         assert set(got) >= {(letter, i) for letter in "XV" for i in (place - 1, place)}
-    assert run.trace.updates is None and run.trace.pairs is None
-    np.testing.assert_array_equal(run.trace.keyframe_ns, run.solution.t_ns)
+    assert run.diagnostics.updates is None and run.diagnostics.pairs is None
+    np.testing.assert_array_equal(run.diagnostics.keyframe_ns, run.solution.t_ns)
 
 
 def test_updates_are_one_a_keyframe_and_end_at_the_causal_states(replayed):
-    updates, causal = replayed.trace.updates, replayed.causal
+    updates, causal = replayed.diagnostics.updates, replayed.causal
     np.testing.assert_array_equal(updates.t_ns, causal.t_ns)
     last = updates.edge[1:] - 1  # the newest keyframe of each window is the causal estimate itself
     np.testing.assert_array_equal(updates.past_ns[last], causal.t_ns)
@@ -56,7 +56,7 @@ def test_updates_are_one_a_keyframe_and_end_at_the_causal_states(replayed):
 
 
 def test_windows_are_as_long_as_the_lag_and_what_they_tell_last_is_the_solution(replayed):
-    updates = replayed.trace.updates
+    updates = replayed.diagnostics.updates
     length = (updates.past_ns[updates.edge[1:] - 1] - updates.past_ns[updates.edge[:-1]]) / NS
     assert length.max() <= 5.0 + 1e-9
     assert length[-1] > 4.0
@@ -66,7 +66,7 @@ def test_windows_are_as_long_as_the_lag_and_what_they_tell_last_is_the_solution(
 
 
 def test_correction_is_the_largest_move_of_what_two_windows_share(replayed):
-    updates = replayed.trace.updates
+    updates = replayed.diagnostics.updates
     k = 20
     before, now = (
         dict(zip(updates.past_ns[a:b].tolist(), updates.past[a:b], strict=True))
@@ -78,7 +78,7 @@ def test_correction_is_the_largest_move_of_what_two_windows_share(replayed):
 
 
 def test_clock_offset_is_followed_from_its_prior_to_what_is_found(replayed):
-    found = replayed.trace.updates.states["gnss_time_offset_s"]
+    found = replayed.diagnostics.updates.states["gnss_time_offset_s"]
     stated = replayed.summary["states"]["gnss_time_offset_s"]
     assert found[-1, 0] == pytest.approx(stated["value"], abs=1e-6)
     # two ways to the covariance: the window's tail, and the recursion over the graph of all keyframes
@@ -89,7 +89,7 @@ def test_clock_offset_is_followed_from_its_prior_to_what_is_found(replayed):
 
 def test_isam2_tells_its_effort_and_a_window_too(session):
     config = Config(replay=ReplayConfig(smoother="isam2", lag_s=5.0, polish=False))
-    updates = replay(session, config).trace.updates
+    updates = replay(session, config).diagnostics.updates
     assert updates.solved[5:].min() > 0
     assert updates.states == {}  # held there
     assert np.diff(updates.edge).max() < 40
