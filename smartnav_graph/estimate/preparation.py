@@ -174,8 +174,10 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     noise, options = notes.calibration.imu_noise, notes.config.standstill
     seen = None if notes.pairs is None else static_periods(notes.pairs)
     imu, gravity = session.require_imu(), session.gravity
-    known_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None
-    notes.rests = find_standstills(imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen, known_ns)
+    available_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None
+    notes.rests = find_standstills(
+        imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen, available_ns
+    )
     return session
 
 

@@ -142,7 +142,7 @@ def find_standstills(
     gravity: float,
     config: StandstillConfig,
     seen: StaticPeriod | None = None,
-    known_ns: int | None = None,
+    available_ns: int | None = None,
 ) -> Standstills:
     """The standstills of a recording.
 
@@ -154,12 +154,12 @@ def find_standstills(
     vehicle : none, car, trolley or foot: only on foot, or where nothing is known, can the device be foot-mounted
     noise : of the sensor, densities; gravity m/s^2
     seen : periods in which a camera was at rest
-    known_ns : end of the data that show whether the device is mounted on a foot; all of them by default
+    available_ns : end of the data that show whether the device is mounted on a foot; all of them by default
     """
     found = Standstills.none(imu.t_ns)
     if config.detect and len(imu) > 2:
         blocks = Blocks.of_samples(imu, gaps, gravity)
-        known = blocks if known_ns is None else Blocks.of_samples(imu.take(imu.t_ns <= known_ns), gaps, gravity)
+        known = blocks if available_ns is None else Blocks.of_samples(imu.take(imu.t_ns <= available_ns), gaps, gravity)
         on_foot = config.mounting == "foot" or (config.mounting == "auto" and is_foot_mounted(known, vehicle))
         found = _rests(blocks, imu.t_ns, noise, gravity, on_foot)
         if config.standing and vehicle == "foot" and not on_foot:

@@ -284,8 +284,8 @@ def test_too_short_and_odd_recordings():
 
 def test_a_replay_decides_by_the_first_seconds_whether_a_device_is_on_a_foot():
     given = foot()[0], None, (), "none", PHONE, GRAVITY, StandstillConfig()
-    assert not find_standstills(*given, known_ns=3 * NS).on_foot
-    assert find_standstills(*given, known_ns=20 * NS).on_foot
+    assert not find_standstills(*given, available_ns=3 * NS).on_foot
+    assert find_standstills(*given, available_ns=20 * NS).on_foot
 
 
 def test_stamps_inside_a_standstill_do_not_wait_for_its_end():
