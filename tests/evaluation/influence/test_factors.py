@@ -40,20 +40,20 @@ def test_rows_are_the_whitened_residuals_of_the_factors(run, influence):
 
 @pytest.mark.parametrize("place", [0, 10, -1])
 def test_the_covariance_is_that_of_the_solution(run, influence, place):
-    """Shares of all sources make up the variance, and pulls balance at the solution."""
+    """Shares of all sources make up the variance, and shifts balance at the solution."""
     found = influence_of_keyframe(influence, range(len(influence.keyframes))[place])
     np.testing.assert_allclose(found.covariance, run.estimate.covariance[place], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found.share.sum(axis=0), 1.0, atol=1e-9)
-    assert np.abs(found.pull.sum(axis=0)).max() < 0.01  # sigma: the solver's last step is as small
+    assert np.abs(found.shift.sum(axis=0)).max() < 0.01  # sigma: the solver's last step is as small
 
 
-def test_a_fix_pulls_against_its_residual(run, influence):
+def test_a_fix_shifts_against_its_residual(run, influence):
     """The fix at a keyframe draws the place to where it lies: against predicted minus recorded."""
     last = len(influence.keyframes) - 1
     found, rows = influence_of_keyframe(influence, last), run.solution.residuals
     mine = rows.of("gnss") & (rows.t_ns == influence.keyframes.t_ns[last])
-    pull = found.pull_here[found.sources.index("gnss"), 3:6]
-    assert (np.sign(pull) == -np.sign(rows.whitened[mine])).all()
+    shift = found.shift_at_keyframe[found.sources.index("gnss"), 3:6]
+    assert (np.sign(shift) == -np.sign(rows.whitened[mine])).all()
 
 
 def test_a_round_trip_is_exact(influence, tmp_path):
@@ -62,7 +62,7 @@ def test_a_round_trip_is_exact(influence, tmp_path):
     one, other = influence_of_keyframe(influence, 5), influence_of_keyframe(back, 5)
     assert one.sources == other.sources
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12)
-    for name in ("share", "here", "without", "pull", "pull_here", "own"):
+    for name in ("share", "at_keyframe", "without", "shift", "shift_at_keyframe", "own"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9, err_msg=name)
     assert back.keyframes.kind.tolist() == influence.keyframes.kind.tolist()
 

@@ -65,15 +65,15 @@ CHAIN = [
 ]
 
 
-def test_shares_pulls_and_absences_along_a_chain():
+def test_shares_shifts_and_absences_along_a_chain():
     found = influence_of_keyframe(Influence(CHAIN, keyframes(2)), 0)
     gnss, imu, _ = range(3)
     np.testing.assert_allclose(found.covariance[EAST, EAST], 0.75)
     # K of the near fix is P = 3/4, of the link P sqrt(2) / 3, of the far fix P / 3
     np.testing.assert_allclose(found.share[:, EAST], [0.75 + 0.75 / 9, 0.75 * 2 / 9, 0.0], atol=1e-12)
-    np.testing.assert_allclose(found.here[:, EAST], [0.75, 0.0, 0.0], atol=1e-12)
-    pulls = np.array([[-0.5625 + 0.1875, 0.375, 0.0], [-0.5625, 0.375, 0.0]]) / np.sqrt(0.75)  # K_f b_f
-    np.testing.assert_allclose([found.pull[:, EAST], found.pull_here[:, EAST]], pulls, atol=1e-12)
+    np.testing.assert_allclose(found.at_keyframe[:, EAST], [0.75, 0.0, 0.0], atol=1e-12)
+    shifts = np.array([[-0.5625 + 0.1875, 0.375, 0.0], [-0.5625, 0.375, 0.0]]) / np.sqrt(0.75)  # K_f b_f
+    np.testing.assert_allclose([found.shift[:, EAST], found.shift_at_keyframe[:, EAST]], shifts, atol=1e-12)
     np.testing.assert_allclose(found.without[imu, EAST], 1.0 / np.sqrt(0.75))
     assert np.isinf(found.without[gnss, EAST])
     np.testing.assert_allclose(found.own[[gnss, imu], EAST], [1.0, np.sqrt(2.0)])
@@ -84,10 +84,10 @@ def test_every_measurement():
     each = influence_of_keyframe(Influence(CHAIN, keyframes(2)), 0).measurements
     far = np.flatnonzero((each.source == "gnss") & (each.t_ns == 10**9))
     np.testing.assert_allclose(each.share[far, EAST], 0.75 / 9)
-    np.testing.assert_allclose(each.pull[far, EAST], 0.25 * 0.75 / np.sqrt(0.75))
+    np.testing.assert_allclose(each.shift[far, EAST], 0.25 * 0.75 / np.sqrt(0.75))
     assert each.row[far] == [7]
     np.testing.assert_allclose(each.share.sum(axis=0), 1.0)
-    np.testing.assert_allclose(each.pull.sum(axis=0), 0.0, atol=1e-12)  # the solution is where pulls balance
+    np.testing.assert_allclose(each.shift.sum(axis=0), 0.0, atol=1e-12)  # the solution is where shifts balance
 
 
 def test_components_are_in_nav_axes():
@@ -96,7 +96,7 @@ def test_components_are_in_nav_axes():
     places = group("gnss", (0,), "X", rows, b=np.array([0.5, 0.0, 0.0]))
     found = influence_of_keyframe(Influence([*prior(0, place=False), places], keyframes(1, TURN)), 0)
     np.testing.assert_allclose(found.sigma[3:6], [2.0, 1.0, 4.0])
-    np.testing.assert_allclose(found.pull[0, 3:6], [0.0, 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(found.shift[0, 3:6], [0.0, 0.5, 0.0], atol=1e-12)
 
 
 def test_a_session_state_is_not_another_keyframe():
@@ -107,7 +107,7 @@ def test_a_session_state_is_not_another_keyframe():
     gnss, calibration = found.sources.index("gnss"), found.sources.index(CALIBRATION)
     # variance of the place: 1 of the fix, (10 / 20)^2 of the clock
     np.testing.assert_allclose(found.share[[gnss, calibration], EAST], [0.8, 0.2])
-    np.testing.assert_allclose(found.here[gnss, EAST], 0.8)
+    np.testing.assert_allclose(found.at_keyframe[gnss, EAST], 0.8)
 
 
 def test_a_keyframe_that_is_not_determined_is_refused():
