@@ -100,16 +100,16 @@ def _polished(
     whole = batch_problem(problem, available_ns)
     initial_values = estimate.values if whole is problem else carried_over(problem, estimate, whole.windows)
     pass_state, total = initial.pass_state, 0
-    moved: dict[str, float] = {}
+    change: dict[str, float] = {}
     while True:
         found, pass_state, passes = solve_passes(
             whole, whole.windows, initial.prior, pass_state, initial_values=initial_values, progress=progress
         )
         metres, degrees = state_distance(states_of(initial_values, found.indices), found.states())
-        moved = moved or {"largest_change_m": metres, "largest_change_deg": degrees}
+        change = change or {"largest_change_m": metres, "largest_change_deg": degrees}
         total += passes
         if (metres < FAR_M and degrees < FAR_DEG) or total >= whole.config.run.passes:
-            return whole, found, pass_state, {**moved, "passes": total}
+            return whole, found, pass_state, {**change, "passes": total}
         initial_values = found.values
 
 

@@ -41,7 +41,7 @@ UNKNOWN_HEIGHT = 1000.0  # m, of a local frame over the pressure at its start
 @dataclass(frozen=True)
 class BarometerConfig:
     """reference_hpa : the day's pressure at sea level, where it is known (else the first samples set the height);
-    reference_sigma : m, of heights from it: the geoid undulates by so much; loss : ``huber`` (doors slam) or ``none``.
+    reference_sigma : m, of heights from it: the geoid undulates by so much; loss : ``huber`` (short peaks) or ``none``.
     """
 
     reference_hpa: float | None = None

@@ -24,7 +24,7 @@ STREAM = "images"
 BORESIGHT = "camera_boresight_rad"
 # A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
 AROUND_S = 0.005
-# Stands in where no camera is calibrated: a phone's at 640 x 480.
+# Used where no camera is calibrated: a phone's at 640 x 480.
 UNKNOWN_CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 

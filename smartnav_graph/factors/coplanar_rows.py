@@ -141,11 +141,11 @@ class Matched:
     """Matches of many pairs, of which a row each is made. Data: `COLUMNS`.
 
     sigma : of a match, normalised coordinates; use (n, k) : padded mask of the matches in use, may change until the
-    row is added; reach : of the Cauchy loss, in sigmas
+    row is added; loss_scale : of the Cauchy loss, in sigmas
     """
 
-    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float) -> None:
-        self.rig, self.sigma, self.use, self.reach, self.there = rig, sigma, use, reach, pairs.there
+    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float) -> None:
+        self.rig, self.sigma, self.use, self.loss_scale, self.there = rig, sigma, use, loss_scale, pairs.there
         self.letters = rig.letters
         x0, x1, shift = pairs.matches
         self.x0, self.x1, self.shift = x0.copy(), x1.copy(), None if shift is None else shift.copy()
@@ -168,7 +168,7 @@ class Matched:
         rows = data[:, 0].astype(np.intp)
         found = self.missed(relative(self.rig, states, data), rows)
         white = (found.residual / self.sigma)[self.there[rows]]
-        weight = loss_weights(white**2, "cauchy", self.reach)[0]
+        weight = loss_weights(white**2, "cauchy", self.loss_scale)[0]
         return Measured(np.nonzero(self.there[rows])[0], white[:, None], weight, self.use[rows][self.there[rows]])
 
 
@@ -181,7 +181,7 @@ class PairRows(Matched):
         there = relative(self.rig, states, data)
         found = self.missed(there, rows)
         white = found.residual / self.sigma
-        weight, cost = loss_weights(white**2, "cauchy", self.reach)
+        weight, cost = loss_weights(white**2, "cauchy", self.loss_scale)
         weight, cost = weight * self.use[rows], cost * self.use[rows]
         by = np.concatenate([found.by_rotation, found.by_translation], axis=-1) / self.sigma
         weighted = (by * weight[..., None]).transpose(0, 2, 1)
@@ -214,8 +214,8 @@ class CompressedRows(Matched):
     it was compressed, is a tenth column beside vec(E).
     """
 
-    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, reach: float, frozen: Relative) -> None:
-        super().__init__(pairs, rig, sigma, use, reach)
+    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float, frozen: Relative) -> None:
+        super().__init__(pairs, rig, sigma, use, loss_scale)
         a, b = rays(self.x0), rays(self.x1)
         E = essential(frozen.R, frozen.t)
         l0, l1 = b @ E.transpose(0, 2, 1), a @ E
@@ -224,7 +224,7 @@ class CompressedRows(Matched):
         if self.shift is not None:
             constant = (self.shift * cross(b @ frozen.R.transpose(0, 2, 1), a)).sum(axis=-1)
             k, missed = np.concatenate([k, constant[..., None]], axis=-1), missed + constant
-        weight = use * loss_weights(missed**2 / square / sigma**2, "cauchy", reach)[0]
+        weight = use * loss_weights(missed**2 / square / sigma**2, "cauchy", loss_scale)[0]
         k = k * np.sqrt(weight / square)[..., None]
         values, vectors = np.linalg.eigh(k.transpose(0, 2, 1) @ k)
         self.root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)

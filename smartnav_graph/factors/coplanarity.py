@@ -289,9 +289,9 @@ class CoplanarityBuilder(Builder):
         """Matches consistent with the rotation (padded), and the verdict on each pair."""
         sigma = np.hypot(self.sigma, TURN_SIGMA + TURN_DRIFT * pairs.length_s)
         found = gate(pairs, R, sigma)
-        return found.inliers, self.outcome(pairs, found.inliers, found.parallax)
+        return found.inliers, self.verdict_by_count(pairs, found.inliers, found.parallax)
 
-    def outcome(self, pairs: Pairs, use: Mask, parallax: Floats) -> NDArray[np.intp]:
+    def verdict_by_count(self, pairs: Pairs, use: Mask, parallax: Floats) -> NDArray[np.intp]:
         """Verdict (n,) by the matches in use (n, k) and the median parallax (n,) rad."""
         kept = use.sum(axis=1)
         share = kept / np.maximum(pairs.count, 1)

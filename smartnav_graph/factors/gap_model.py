@@ -112,7 +112,7 @@ class Recorded:
 # A feature: mean before (-1) or after (+1) the gap, from and to s away; of no length: the sample at the border.
 Feature = tuple[int, float, float]
 FEATURES: tuple[Feature, ...] = tuple((side, a, b) for side in (-1, 1) for a, b in ((0.0, 0.0), *MOMENTS))
-REACH = MOMENTS[-1][1]
+MARGIN_S = MOMENTS[-1][1]
 
 
 def _features(recorded: Recorded, start: Floats, end: Floats, features: Sequence[Feature]) -> Floats:
@@ -159,15 +159,15 @@ class FittedModel:
 
 def _fit(recorded: Recorded, length: float, features: Sequence[Feature]) -> FittedModel | None:
     """Weights for gaps of `length` s; None where there are too few valid stretches."""
-    first, last = recorded.t[0] + REACH, recorded.t[-1] - length - REACH
+    first, last = recorded.t[0] + MARGIN_S, recorded.t[-1] - length - MARGIN_S
     start = np.arange(first, last, max(length / 4, (last - first) / MOST))
-    start = start[recorded.valid(start - REACH, start + length + REACH)]
+    start = start[recorded.valid(start - MARGIN_S, start + length + MARGIN_S)]
     if len(start) < LEAST:
         return None
     end = start + length
     mean, slant, seen = recorded.mean(start, end), recorded.slant(start, end), _features(recorded, start, end, features)
     level = mean.mean(axis=0)
-    fold, apart = _folds(start, length + 2.0 * REACH)
+    fold, apart = _folds(start, length + 2.0 * MARGIN_S)
     x = (seen - level[:, None]).transpose(1, 0, 2)
     best = [
         [_best(y, rows, fold, apart, targets) for y, rows in zip(truth.T, x, strict=True)]
@@ -199,11 +199,11 @@ def _sines(recorded: Recorded, start: Floats, length: float, predict: Floats) ->
     return np.asarray(np.einsum("nk,mka->nma", sines, left))
 
 
-def _folds(start: Floats, reach: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _folds(start: Floats, margin_s: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Fold (m,) of every stretch, contiguous in time, and which stretches (folds, m) are disjoint from each fold."""
     edges = np.linspace(start[0], start[-1], FOLDS + 1)
     fold = np.clip(np.searchsorted(edges, start, side="right") - 1, 0, FOLDS - 1)
-    apart = (start < edges[:-1, None] - reach) | (start > edges[1:, None] + reach)
+    apart = (start < edges[:-1, None] - margin_s) | (start > edges[1:, None] + margin_s)
     return fold, apart
 
 
@@ -246,7 +246,7 @@ def _ridge(y: Floats, x: Floats, target: Floats, ridge: float) -> Floats:
 
 def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = False) -> dict[int, Bridge]:
     """The best bridge of every gap, by its start stamp. Where no valid stretch is as long as a gap, shorter ones
-    are used. `causal` : each is fitted to what was recorded by `REACH` after it, or in the first `INITIALISATION_S`."""
+    are used. `causal` : each is fitted to the data until `MARGIN_S` after it, or in the first `INITIALISATION_S`."""
     if not gaps:
         return {}
     if not causal:
@@ -254,7 +254,7 @@ def bridges(imu: Imu, gaps: Sequence[Gap], floor: ImuNoise, *, causal: bool = Fa
         return {gap.start_ns: _bridge(recorded, gap, imu, floor) for gap in gaps}
     found = {}
     for gap in gaps:
-        now = max(gap.end_ns + round(REACH * NS), int(imu.t_ns[0]) + round(INITIALISATION_S * NS))
+        now = max(gap.end_ns + round(MARGIN_S * NS), int(imu.t_ns[0]) + round(INITIALISATION_S * NS))
         known = imu.take(imu.t_ns <= now)
         recorded = Recorded(known, [other for other in gaps if other.end_ns <= known.t_ns[-1]])
         found[gap.start_ns] = _bridge(recorded, gap, known, floor)

@@ -167,20 +167,20 @@ class GravityBuilder(Builder):
         return float(np.linalg.norm(parts))
 
 
-# Size of the mean force (m/s^2) that an accelerometer bias may be off by without telling an acceleration.
+# Size of the mean force (m/s^2) that an accelerometer bias may be off by without a detected acceleration.
 BIAS_SLACK = 0.2
 # Scatter of the force's size (m/s^2) that a sensor at rest may have.
 REST_SCATTER = 0.1
 
 
 def build(context: FactorContext) -> GravityBuilder | None:
-    """The tilt of whoever has nothing else."""
+    """The builder where nothing else observes the tilt."""
     config = context.options(GravityConfig)
     carried = context.vehicle == "foot" and not context.on_foot  # a car nobody declared is no walker
     if config.enabled == "off" or (config.enabled == "auto" and not carried):
         return None
     stamps = [stream.t_ns for name, stream in context.session.streams().items() if name in HOLDS_TILT]
-    if context.rests is not None:  # from a rest on the gyro holds it for a while
+    if context.rests is not None:  # after a rest the gyroscope keeps it for a while
         stamps.append(np.array(context.rests.rests(), dtype=np.int64).ravel())
     held_ns = np.sort(np.concatenate([np.zeros(0, np.int64), *stamps]))
     return GravityBuilder(context.session.gravity, held_ns, config)

@@ -46,7 +46,7 @@ MODEL_SIGMA_UT = 2.0
 # Intensities (uT) that a reading without large hard iron can have: the Earth's field, give or take iron nearby.
 EARTHLY_UT = (20.0, 70.0)
 # Cauchy's constant that keeps 95 % efficiency on Gaussian residuals (Holland, Welsch 1977), for rows of three.
-REACH = 2.385 * float(np.sqrt(3.0))
+LOSS_SCALE = 2.385 * float(np.sqrt(3.0))
 # More samples than this in a window add no information.
 MOST_SAMPLES = 25
 # A fixed hard iron with a larger sigma (uT) leaves no usable direction.
@@ -164,9 +164,9 @@ class MagnetometerBuilder(Builder):
         used = self.usable(pass_state) and not self.disturbed(level, known)
         data = np.concatenate([y, A.ravel(), [np.sin(self.declination), np.cos(self.declination), sigma]])
         keys = (key("X", update.index), key("V", update.index), update.use(iron), update.use(self.field))
-        loss, reach = self.config.loss, REACH / float(np.sqrt(shared))
+        loss, loss_scale = self.config.loss, LOSS_SCALE / float(np.sqrt(shared))
         update.blocks.append(
-            FactorBatch(self.name, MODEL, [keys], data[None], update.t_ns, (last - 1,), (used,), loss, reach)
+            FactorBatch(self.name, MODEL, [keys], data[None], update.t_ns, (last - 1,), (used,), loss, loss_scale)
         )
 
     def sigma(self, length_s: float, count: int) -> float:

@@ -98,7 +98,7 @@ class RearWheels:
 class WheelBuilder(Builder):
     """Adds one row a period where readings surround the keyframe.
 
-    body_R_vehicle (3, 3) : declared axes; default_sigma : m/s, of readings that carry none. Such a sigma stands for
+    body_R_vehicle (3, 3) : declared axes; default_sigma : m/s, of readings that carry none. Such a sigma covers
     slip and quantisation, which do not average out; a reading's own is taken as white. causal : whether speeds have a
     sign is known from the readings so far, not from all.
     """
@@ -141,7 +141,7 @@ class WheelBuilder(Builder):
         update.blocks.append(FactorBatch(self.name, self.model, [keys], data[None], update.t_ns, loss=self.config.loss))
 
     def _unsigned(self, t_ns: int) -> bool:
-        """Whether no reading that counts at a time is negative, as of a sensor that cannot tell backwards."""
+        """Whether no reading that counts at a time is negative, as of a sensor without sign."""
         first = self._first_negative_ns
         return first is None or (self.causal and first > t_ns + round(HALF_LINE_S * NS))
 

@@ -46,12 +46,12 @@ def check_loss(section: str, loss: str, known: tuple[str, ...] = LOSSES) -> None
         raise ConfigError(f"config [{section}]", f"loss = {loss!r}", f"{', '.join(known[:-1])} or {known[-1]}")
 
 
-def loss_weights(square: Floats, loss: str, reach: Floats | float = 1.0, dim: int = 1) -> tuple[Floats, Floats]:
+def loss_weights(square: Floats, loss: str, loss_scale: Floats | float = 1.0, dim: int = 1) -> tuple[Floats, Floats]:
     """Weight (m,) and cost (m,) of rows with squared norm `square` (m,) under a loss: none, huber or cauchy(1), for
-    norms of `dim` components in units of `reach` (m,)."""
+    norms of `dim` components in units of `loss_scale` (m,)."""
     if loss == "none":
         return np.ones_like(square), 0.5 * square
-    scale = np.square(reach)
+    scale = np.square(loss_scale)
     square = square / scale
     if loss == "cauchy":
         return 1.0 / (1.0 + square), 0.5 * scale * np.log1p(square)
@@ -70,13 +70,13 @@ def expected_weighted_square(loss: str, dim: int) -> float:
     return float((loss_weights(square, loss, 1.0, dim)[0] * square).mean() / dim)
 
 
-def robust(model: gtsam.noiseModel.Base, loss: str, reach: float = 1.0) -> gtsam.noiseModel.Base:
+def robust(model: gtsam.noiseModel.Base, loss: str, loss_scale: float = 1.0) -> gtsam.noiseModel.Base:
     """A GTSAM noise model under a loss, as `loss_weights` has it."""
     if loss == "none":
         return model
     estimators = gtsam.noiseModel.mEstimator
     limit = huber_limit(model.dim())
-    estimator = estimators.Huber.Create(limit * reach) if loss == "huber" else estimators.Cauchy.Create(reach)
+    estimator = estimators.Huber.Create(limit * loss_scale) if loss == "huber" else estimators.Cauchy.Create(loss_scale)
     return gtsam.noiseModel.Robust.Create(estimator, model)
 
 

@@ -64,7 +64,7 @@ class FactorBatch:
     fixed lag, CustomFactors in iSAM2.
 
     rows : row of the stream behind each, -1 where there is none; used : False keeps a row out of the solve, its
-    residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row divided by `reach`
+    residual is still reported; loss : ``none``, ``huber`` or ``cauchy``, on the norm of each row over `loss_scale`
     """
 
     sensor: str
@@ -75,7 +75,7 @@ class FactorBatch:
     rows: Sequence[int] = ()
     used: Sequence[bool] = ()
     loss: str = "none"
-    reach: float = 1.0
+    loss_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.rows:

@@ -56,7 +56,7 @@ class StackedFactors:
         self.model, self.blocks, self.held = model, blocks, held
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
-        self.reach = np.repeat([block.reach for block in blocks], [len(block.keys) for block in blocks])
+        self.loss_scale = np.repeat([block.loss_scale for block in blocks], [len(block.keys) for block in blocks])
         self.used = np.array([used for block in blocks for used in block.used], dtype=bool)
         self.data = np.concatenate([block.data for block in blocks])
 
@@ -72,7 +72,7 @@ class StackedFactors:
 
     def weight(self, residual: Floats) -> Floats:
         """Weight (m,) of the loss on whitened residuals (m, d)."""
-        return loss_weights((residual**2).sum(axis=1), self.loss, self.reach, residual.shape[1])[0]
+        return loss_weights((residual**2).sum(axis=1), self.loss, self.loss_scale, residual.shape[1])[0]
 
     def linearize(self, values: gtsam.Values | Snapshot) -> tuple[Floats, list[Floats]]:
         """Whitened residuals (m, d) of all rows, used or not, and their Jacobians, without the loss.
@@ -106,7 +106,7 @@ class StackedFactors:
         """Half the sum of squares of the used rows, under the loss."""
         residual = self.linearize(values)[0][self.used]
         square, dim = (residual**2).sum(axis=1), residual.shape[1]
-        return float(loss_weights(square, self.loss, self.reach[self.used], dim)[1].sum())
+        return float(loss_weights(square, self.loss, self.loss_scale[self.used], dim)[1].sum())
 
     def add_to(self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values | Snapshot) -> None:
         """Append one linear factor a used row; held states and states that nothing depends on have no column."""
@@ -211,7 +211,7 @@ def custom_factor(block: FactorBatch, row: int, held: FixedStates) -> gtsam.Cust
 
     if model not in _SIZES:
         _SIZES[model] = len(model.linearize([_zero(letter) for letter in model.letters], data)[0][0])
-    noise = robust(gtsam.noiseModel.Unit.Create(_SIZES[model]), block.loss, block.reach)
+    noise = robust(gtsam.noiseModel.Unit.Create(_SIZES[model]), block.loss, block.loss_scale)
     return gtsam.CustomFactor(noise, [keys[i] for i in free], error)
 
 

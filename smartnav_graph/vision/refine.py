@@ -216,7 +216,7 @@ def refine(
 
     Parameters
     ----------
-    reach : of a Geman-McClure loss on each match, in sigmas; None: least squares
+    loss_scale : of a Geman-McClure loss on each match, in sigmas; None: least squares
     prior : added as a residual without loss
     """
     fit, damping = _linearised(model, state, loss_scale, prior), FIRST_DAMPING

@@ -15,8 +15,8 @@ from smartnav_graph.core.errors import CalibrationError, ConfigError
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.magnetometer import (
+    LOSS_SCALE,
     MODEL,
-    REACH,
     MagnetometerBuilder,
     MagnetometerConfig,
     SeenField,
@@ -168,9 +168,9 @@ def test_the_loss_acts_on_what_a_row_is_off_by_itself():
     shared = MagnetometerNoise(sigma_ut=0.1, disturbance_ut=3.0, disturbance_s=2.0, hard_iron_sigma_ut=1.0)
     for noise, factor in ((shared, 2.0), (replace(shared, disturbance_ut=0.0), 1.0)):
         (block,) = step_of(builder(noise=noise), turning((0.0, 0.0, 0.0))).blocks
-        assert block.loss == "cauchy" and block.reach == pytest.approx(REACH / factor)
+        assert block.loss == "cauchy" and block.loss_scale == pytest.approx(LOSS_SCALE / factor)
     # of the row's own 3 uT, not of the 6 uT that four rows with one disturbance have
-    assert builder(noise=shared).sigma(1.0, 10) * REACH / 2.0 == pytest.approx(3.0 * REACH, rel=0.01)
+    assert builder(noise=shared).sigma(1.0, 10) * LOSS_SCALE / 2.0 == pytest.approx(3.0 * LOSS_SCALE, rel=0.01)
 
 
 @pytest.mark.parametrize(

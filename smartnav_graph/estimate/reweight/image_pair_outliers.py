@@ -106,7 +106,7 @@ def _by_states(
     geometry = Geometry.of(pairs, there.R)
     use = (white < GATE * scale) & pairs.there
     use &= geometry.plausible(there.t, np.full(len(pairs), builder.sigma * scale), use)
-    verdict = builder.outcome(pairs, use, geometry.parallax())
+    verdict = builder.verdict_by_count(pairs, use, geometry.parallax())
     good = use & (verdict == IN_USE)[:, None]
     left = int(good.sum()) - POSE_DOF * int((verdict == IN_USE).sum())
     if left > POSE_DOF:
