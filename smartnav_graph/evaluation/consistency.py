@@ -1,4 +1,4 @@
-"""Consistency of the covariance: normalised estimation error squared (NEES) and its chi-square bounds.
+"""Consistency of the covariance: normalised estimation error squared (NEES).
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 5.4.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from smartnav_graph.core.arrays import Floats, Mask
 
@@ -34,10 +33,3 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
     good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
     out[good] = np.einsum("ni,ni->n", e[good], np.linalg.solve(P[good], e[good][:, :, None])[:, :, 0])
     return out
-
-
-def chi2_bounds(dof: int, probability: float = 0.95) -> tuple[float, float]:
-    """Two-sided interval that one NEES of `dof` degrees of freedom lies in with `probability`."""
-    tail = 0.5 * (1.0 - probability)
-    # chi-square quantile as a gamma quantile: scipy.stats takes half a second to import
-    return 2.0 * float(gammaincinv(0.5 * dof, tail)), 2.0 * float(gammaincinv(0.5 * dof, 1.0 - tail))

@@ -35,10 +35,6 @@ class Redundancy(NamedTuple):
     fitted: float
     square: float
 
-    @property
-    def value(self) -> float:
-        return self.residuals - self.fitted
-
 
 def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     """Redundancy by name of the factors' `FactorId`, and of the priors of the session states (`CALIBRATION`).

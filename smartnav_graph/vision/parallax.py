@@ -16,12 +16,6 @@ CLEAR = 3.0  # sigmas of parallax beyond which front and behind are certain
 ALIKE = 0.1  # share of the matches: smallest significant difference of votes between two poses
 
 
-def parallax(matched: MatchedPoints, R: Floats) -> Floats:
-    """Angle (m,) rad between the rays of each match, in the same axes."""
-    a, y = rays(matched.xy0), rays(matched.xy1) @ R.T
-    return np.asarray(np.arctan2(np.linalg.norm(cross(a, y), axis=1), np.einsum("mi,mi->m", a, y)))
-
-
 def in_front(matched: MatchedPoints, R: Floats, t: Floats) -> Floats:
     """Vote (m,) of every match: 1 in front of both cameras, -1 behind one, nearer to 0 the less parallax it has.
 

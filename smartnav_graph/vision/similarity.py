@@ -25,13 +25,12 @@ ITERATIONS, CONVERGED = 100, 1e-12
 
 @dataclass(frozen=True)
 class Similarity:
-    """s, nav_R_map (3, 3), nav_t_map (3,) m; `sigma` m of one coordinate from the `residual` (n, 3) m, and the
+    """s, nav_R_map (3, 3), nav_t_map (3,) m; `sigma` m of one coordinate from the residuals, and the
     standard deviations `rotation_sigma` (3,) rad of the rotation about the nav axes."""
 
     scale: float
     nav_R_map: Floats
     nav_t_map: Floats
-    residual: Floats
     sigma: float
     rotation_sigma: Floats
 
@@ -70,7 +69,7 @@ def fit_similarity(map_t_cam: Floats, map_t_lever: Floats, nav_t_body: Floats, w
     residual = nav_t_body - found - shift
     sigma = float(np.sqrt(np.sum(residual**2) / (3 * n - 7)))
     rotation_sigma = _rotation_sigma(found - found.mean(axis=0), sigma, where)
-    return Similarity(scale, R, shift, residual, sigma, rotation_sigma)
+    return Similarity(scale, R, shift, sigma, rotation_sigma)
 
 
 def _spread(x: Floats) -> float:

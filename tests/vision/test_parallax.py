@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from view_pairs import FORWARD, NOWHERE, SIDEWAYS, SIGMA, view
 
 from smartnav_graph.vision.epipolar import sampson
-from smartnav_graph.vision.parallax import cheirality, in_front, parallax
+from smartnav_graph.vision.parallax import cheirality, in_front
 from smartnav_graph.vision.ransac import direction_by_samples
 from smartnav_graph.vision.refine import MatchedPoints
 
@@ -17,12 +17,6 @@ def matched(pair):
 
 def twin(R, t):
     return Rotation.from_rotvec(np.pi * t).as_matrix() @ R
-
-
-def test_parallax_is_the_angle_a_baseline_is_seen_under():
-    xy0, xy1 = np.array([[0.0, 0.0], [0.1, 0.0]]), np.array([[-0.2, 0.0], [0.1, 0.0]])
-    found = parallax(MatchedPoints(xy0, xy1, np.ones(2)), np.eye(3))
-    np.testing.assert_allclose(found, [np.arctan(0.2), 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD])

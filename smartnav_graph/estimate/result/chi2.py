@@ -19,7 +19,7 @@ from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
 
 # Redundancy below which a sum of squares has no information on a sensor's noise.
 LEAST_REDUNDANCY = 1.0
-# Factors that stand for many measurements, matches or observations of tracks, each of which has a residual. Those in
+# Factors of many measurements, matches or observations of tracks, each of which has a residual. Those in
 # use are inside their gate and count in full: under their loss the sum would be too small.
 IMAGES = ("image_pairs", SMART)
 

@@ -124,11 +124,6 @@ class PairAccount:
     outliers: int
     refused: str
 
-    @property
-    def redundancy(self) -> int:
-        """Matches in use beyond what the poses of their pairs take."""
-        return self.matches - self.outliers - POSE_DOF * self.pairs[REASONS[IN_USE]]
-
 
 def pair_account(builders: Iterable[Builder], pass_state: PassState) -> PairAccount | None:
     """The account of the image pairs of a run; None where there are none, or tracks replace them."""

@@ -185,11 +185,6 @@ class TrackAccount:
         """Tracks in use."""
         return self.tracks[REASONS[IN_USE]]
 
-    @property
-    def redundancy(self) -> int:
-        """Coordinates in use beyond what the points take."""
-        return 2 * (self.observations - self.outliers) - POINT_DOF * self.points
-
 
 def track_account(builders: Iterable[Builder], pass_state: PassState) -> TrackAccount | None:
     """The account of the tracks of a run; None where they are not asked for."""

@@ -45,7 +45,7 @@ STEEP_DEG = 5.0
 AHEAD_M = 100.0  # the azimuth is that of a point at this distance on the optical axis
 GPS_IFD = 0x8825
 # Tags of the GPS part, Exif 3.0 table 15.
-VERSION, DATUM, PROCESSING, ERROR = 0, 18, 27, 31
+VERSION, DATUM, ERROR = 0, 18, 31
 LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT = range(1, 7)
 TIME, DIRECTION_REF, DIRECTION, DATE = 7, 16, 17, 29
 
