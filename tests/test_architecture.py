@@ -18,7 +18,7 @@ API = "__init__"  # it alone may import everything
 HEAVY = {"rerun", "cv2", "pycolmap", "pandas", "matplotlib"}
 
 FOLDERS, FILE_LINES, FUNCTION_LINES = 13, 400, 60
-ANY = 90  # uses of typing.Any in the package
+ANY = 60  # uses of typing.Any in the package
 # Names that have one role in every module of a kind; they are used with the name of the module.
 SAME_ROLE = {"build", "draw", "load", "read", "replay", "smooth"}
 
