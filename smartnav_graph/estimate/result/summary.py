@@ -23,7 +23,7 @@ from smartnav_graph.estimate.reweight.image_pair_outliers import PairAccount, pa
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.update import OBSERVED
-from smartnav_graph.factors.coplanarity import CONTRARY, REASONS, SMART
+from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS, SMART
 from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.solution import POS, Solution
@@ -52,13 +52,12 @@ def peak_memory_mb() -> float:
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
 
 
-def _doubts(estimate: Estimate, absolute: bool, chi2: float) -> list[str]:
+def _doubts(estimate: Estimate, mode: str, chi2: float) -> list[str]:
     """Reasons to doubt the solution."""
     doubts = []
-    if not absolute:
-        doubts.append(
-            "dead reckoning: no absolute measurement holds the trajectory, errors grow with time; add position fixes"
-        )
+    if mode != "batch":
+        relative = mode.replace("dead-", "dead ")
+        doubts.append(f"{relative}: no absolute position measurement, errors grow with time; add position fixes")
     if not estimate.converged:
         doubts.append("solve: the iteration limit was reached before the cost settled; raise solver.max_iterations")
     if chi2 > MISFIT:
@@ -80,19 +79,21 @@ def summarise(
     """The content of summary.json; `extra` overrides and adds."""
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
-    absolute = bool(used_counts(problem, pass_state))
+    used = used_counts(problem, pass_state)
     seen, tracks = (
         pair_account(problem.builders, pass_state),
         track_outliers.track_account(problem.builders, pass_state),
     )
     fit = chi2_of(solved, keyframes, tracks)
     chi2 = fit.per_dof()
+    images = (seen is not None and seen.pairs[REASONS[IN_USE]] > 0) or (tracks is not None and tracks.in_force)
+    mode = "batch" if used else "visual-inertial odometry" if images else "dead-reckoning"
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused]
-    warnings = [*problem.warnings, *refused, *_doubts(estimate, absolute, chi2["overall"] if together else 0.0)]
+    warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     summary: dict[str, Any] = {
-        "mode": "batch" if absolute else "dead-reckoning",
+        "mode": mode,
         "vehicle": problem.vehicle,
         "session": _session(problem.session),
         "duration_s": duration,
@@ -112,7 +113,7 @@ def summarise(
         "gaps": _gaps(problem),
         "standstills": _standstills(problem),
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
-        "used": dict(used_counts(problem, pass_state)),
+        "used": dict(used),
         "rejected": _rejected(pass_state, seen, tracks),
         **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
         **({} if tracks is None else {"tracks": dict(tracks.tracks)}),

@@ -83,6 +83,12 @@ def test_dead_reckoning_is_a_mode_of_its_own(eight):
     assert summary["position_sigma_m"]["max"] > summary["position_sigma_m"]["median"]
 
 
+def test_images_without_positions_are_visual_inertial_odometry():
+    summary = sn.run(sn.simulate("room-30s", 1), end_s=8.0).summary
+    assert summary["mode"] == "visual-inertial odometry" and summary["used"] == {}
+    assert any(text.startswith("visual-inertial odometry: no absolute position") for text in summary["warnings"])
+
+
 def test_control_points_count_as_absolute(eight):
     session = eight.replace(gnss=None, sensors={}, control=on_control(eight, slice(0, None, 5), 0.05, 0))
     summary = sn.run(session).summary

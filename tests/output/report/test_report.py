@@ -361,6 +361,11 @@ def test_dead_reckoning_is_named(tmp_path, case) -> None:
     assert "there is no absolute position measurement" in words(section(dom, "headline"))
 
 
+def test_visual_inertial_odometry_is_named(tmp_path, case) -> None:
+    dom = written(tmp_path, case, summary={"mode": "visual-inertial odometry"})
+    assert "was processed by visual-inertial odometry; there is no absolute" in words(section(dom, "headline"))
+
+
 def test_replay_has_its_kind_delay_and_final_solution(tmp_path, case) -> None:
     polish = {"largest_change_m": 0.0213, "largest_change_deg": 0.05, "passes": 2}
     extra = {"mode": "replay fixed-lag, interrupted", "delay_s": 29.9, "polish": polish}
