@@ -8,6 +8,7 @@ import numpy as np
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.rerun_log import colours, signals
 from smartnav_graph.output.rerun_log.cameras import CameraView
@@ -296,7 +297,7 @@ def _residuals(recorder: Recorder, solution: Solution | None) -> list[View]:
     sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
         series_view(
-            f"Residuals {name} (σ)",
+            f"Residuals {title_of(name)} (σ)",
             [f"/residuals/{name}/**"],
             legend=_few(solution, name),
             limits=recorder.limits.get(f"/residuals/{name}"),

@@ -11,7 +11,7 @@ from smartnav_graph.output.rerun_log import blueprint, recorder, spatial
 
 def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
     names = recording.view_names()
-    assert {"Report", "Map", "Accelerometer m/s²", "Gyroscope rad/s", "States", "Log", "Residuals gnss (σ)"} <= set(
+    assert {"Report", "Map", "Accelerometer m/s²", "Gyroscope rad/s", "States", "Log", "Residuals GNSS (σ)"} <= set(
         names
     )
     assert {"Position error m, bands 1σ 3σ", "Accelerometer bias m/s², bands 1σ 3σ", "Rotation error °"} <= set(names)

@@ -41,7 +41,7 @@ def test_every_factor_is_joined_with_the_states_it_touches():
     assert {("imu", "imu bias 1"), ("imu", "velocity 2")} <= set(edges_by_name(picture))
 
 
-def test_what_lies_before_stands_together():
+def test_earlier_keyframes_are_one_node():
     picture = factor_graph.picture_of(FACTORS[3:], first=2)
     assert "pose 1" not in picture.labels and "pose 2" in picture.labels
     assert edges_by_name(picture).count(("imu", "earlier")) == 1  # three states, one edge
@@ -66,7 +66,7 @@ def test_each_moment_shows_the_last_keyframes(tmp_path, monkeypatch):
     assert "Factor graph" in found.view_names()
 
 
-def test_places_do_not_hang_on_the_order_of_a_set():
+def test_places_do_not_depend_on_the_order_of_a_set():
     """States with the same index: the camera's clock and its attitude."""
     factors = [("image_pairs", [("X", 0), ("T", 10), ("A", 10), ("L", 10)])]
     labels = [label for label in factor_graph.picture_of(factors, first=0).labels if label != "image_pairs"]
