@@ -107,7 +107,7 @@ def test_the_command_makes_and_keeps_matches(folder, capsys):
     assert (code, err) == (0, "")
     assert "pictures: 4 of 4 used" in out and f"matches: {folder}/matches.parquet\n" in out
     code, out, _ = call(capsys, "match", folder, "--features", "akaze")
-    assert code == 0 and "kept from before" in out
+    assert code == 0 and "read from an earlier call" in out
     code, out, _ = call(capsys, "match", folder, "--features", "akaze", "--json")
     told = json.loads(out)
     assert told["computed"] is False and told["pairs"] == 5 and told["skipped"] == {}
@@ -143,7 +143,7 @@ def test_match_files_go_out_and_in(folder, tmp_path, capsys):
         (
             ("--camera", "cam7", "--from-file", "m.txt", "--force"),
             1,
-            "--camera: 'cam7'; expected one that took images: cam0",
+            "--camera: 'cam7'; expected one with images: cam0",
         ),
         (("--from-file", "absent.txt", "--force"), 1, "absent.txt: is missing"),
         (("--from-file", "a", "--to-file", "b"), 1, "one of them"),
@@ -160,7 +160,7 @@ def test_what_the_command_refuses(folder, capsys, monkeypatch, arguments, code, 
 def test_a_camera_without_calibration_cannot_read_match_files(folder, tmp_path, capsys):
     (folder / "calibration.toml").write_text(calibration_model.calibration_toml(calibration_model.Calibration()))
     code, _, err = call(capsys, "match", folder, "--to-file", tmp_path / "m.txt")
-    assert code == 1 and "knows no camera cam0; expected [cameras.cam0]" in err
+    assert code == 1 and "has no camera cam0; expected [cameras.cam0]" in err
 
 
 def test_a_log_is_imported_first(capsys):
