@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
+from rich.console import Console
+from rich.table import Table
 
 from smartnav_graph import readers
 from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names
@@ -221,9 +223,6 @@ def map_text(path: Path, report: Mapping[str, object]) -> str:
 
 def print_scores(found: Sequence[Score], *, all_known: bool) -> None:
     """A table of our figures and those of the thesis; features that OpenCV lacks have only the latter."""
-    from rich.console import Console
-    from rich.table import Table
-
     table = Table(title=f"policy {found[0].policy}, {found[0].pairs} pairs", title_justify="left")
     table.add_column("features")
     for heading in ("true", ">= 5 true", "matches", "ms / image", "ms / pair", "thesis true", ">= 5 true", "s"):

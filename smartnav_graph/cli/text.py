@@ -6,6 +6,9 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from rich.console import Console
+from rich.text import Text
+
 from smartnav_graph.output.summary_json import Summary, imu_gaps, list_of, numbers_of, plain, table_of, text_of
 from smartnav_graph.session.session import Session
 
@@ -14,9 +17,6 @@ STYLES = {"error:": "bold red", "warning:": "yellow", "missing:": "cyan"}
 
 def print_findings(text: str) -> None:
     """Lines on stdout, coloured by severity on a terminal."""
-    from rich.console import Console
-    from rich.text import Text
-
     console = Console(soft_wrap=True, highlight=False)
     for line in text.splitlines():
         console.print(Text(line, style=STYLES.get(line.split(" ", 1)[0], "")))

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from smartnav_graph.core.files import replacing
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
@@ -37,9 +38,6 @@ from smartnav_graph.output.rerun_log.recorder import Recorder, RecordingClock, f
 from smartnav_graph.output.rerun_log.viewer import view
 from smartnav_graph.output.summary_json import Summary, table_of
 from smartnav_graph.session.session import Session
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 __all__ = ["view", "write_latency", "write_recording"]
 
@@ -181,8 +179,6 @@ def _log_all(recorder: Recorder, shown: _Shown) -> rrb.Blueprint:
 
 def _log_scene(recorder: Recorder, shown: _Shown, extent: spatial.Extent, found: events.Events) -> float:
     """Positions and map; the magnification of the ellipsoids."""
-    import rerun as rr
-
     recorder.style("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     scene = spatial.SpatialLog(recorder, shown.session, extent)
     if shown.session.reference is not None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.archetypes import TextLogColumns
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
@@ -16,11 +21,7 @@ from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.output.rerun_log.spatial import Extent, nice
 from smartnav_graph.session.session import Session
 
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-    from rerun.blueprint.archetypes import TextLogColumns
-
-    View: TypeAlias = rrb.View | rrb.Container
+View: TypeAlias = rrb.View | rrb.Container
 
 Names = tuple[tuple[str, str], ...]
 
@@ -28,15 +29,6 @@ _MOTION: Names = (
     ("Speed m/s", "/motion/speed"),
     ("Heading, pitch, roll °", "/motion/attitude"),
     ("Height m", "/motion/height"),
-)
-_SIGNALS: Names = (
-    ("Accelerometer m/s²", "/imu/accel"),
-    ("Gyroscope rad/s", "/imu/gyro"),
-    ("Magnetometer µT", "/magnetometer"),
-    ("Pressure hPa", "/barometer"),
-    ("Temperature °C", "/temperature"),
-    ("Velocity m/s (body)", "/velocity"),
-    ("Wheel speed m/s", "/wheel"),
 )
 _ACCURACY: Names = (
     ("Position error m, bands 1σ 3σ", "/error/position"),
@@ -87,12 +79,11 @@ def build(
 ) -> rrb.Blueprint:
     """Left the path with graph, report, map and cameras; right the plots over time. `factor` magnifies the ellipsoids
     of the path."""
-    import rerun.blueprint as rrb
-
     kind = recording_kind(recorder, session, solution)
-    flat = _row(_flat_views(recorder, session, extent, views))
+    flat_views = _flat_views(recorder, session, extent, views)
+    flat = _single(flat_views, lambda: rrb.Horizontal(*flat_views))
     left = _stack([_tabs(_scenes(recorder, solution, extent, factor)), flat], [1, 1] if kind == "vision" else [3, 2])
-    right = _right(recorder, solution, kind)
+    right = _right(recorder, session, solution, kind)
     sides = [side for side in (left, right) if side is not None]
     return rrb.Blueprint(
         rrb.Horizontal(*sides, column_shares=[3, 2][: len(sides)]),
@@ -105,33 +96,21 @@ def build(
 
 
 def _stack(parts: list[View | None], shares: list[float]) -> View | None:
-    import rerun.blueprint as rrb
-
     there = [(part, share) for part, share in zip(parts, shares, strict=True) if part is not None]
-    if len(there) < 2:
-        return there[0][0] if there else None
-    return rrb.Vertical(*(part for part, _ in there), row_shares=[share for _, share in there])
+    views = [part for part, _ in there]
+    return _single(views, lambda: rrb.Vertical(*views, row_shares=[share for _, share in there]))
 
 
 def _tabs(views: list[View]) -> View | None:
-    import rerun.blueprint as rrb
-
-    if len(views) < 2:
-        return views[0] if views else None
-    return rrb.Tabs(*views, active_tab=0)
+    return _single(views, lambda: rrb.Tabs(*views, active_tab=0))
 
 
-def _row(views: list[View]) -> View | None:
-    import rerun.blueprint as rrb
-
-    if len(views) < 2:
-        return views[0] if views else None
-    return rrb.Horizontal(*views)
+def _single(views: list[View], container: Callable[[], View]) -> View | None:
+    """A container of several views; a single view alone."""
+    return container() if len(views) > 1 else views[0] if views else None
 
 
 def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None, factor: float) -> list[View]:
-    import rerun.blueprint as rrb
-
     views: list[View] = []
     if extent is not None and recorder.has("/world"):
         name = "Path (ENU)"
@@ -151,8 +130,6 @@ def _scenes(recorder: Recorder, solution: Solution | None, extent: Extent | None
 
 def _behind_body(solution: Solution, extent: Extent) -> rrb.Spatial3DView:
     """The scene from behind and above the moving body: with camera, velocity and the ellipsoid at true size."""
-    import rerun.blueprint as rrb
-
     ahead, _, up = frames.body_R_vehicle(solution.forward, solution.up).T
     near = NEAR * extent.size
     return rrb.Spatial3DView(
@@ -166,9 +143,6 @@ def _behind_body(solution: Solution, extent: Extent) -> rrb.Spatial3DView:
 
 def world_view(name: str, extent: Extent, direction: Floats, up: list[float]) -> rrb.Spatial3DView:
     """The scene seen along `direction`, from where everything is visible."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     return rrb.Spatial3DView(
         name=name,
         origin="/world",
@@ -215,8 +189,6 @@ def _flat_views(recorder: Recorder, session: Session, extent: Extent | None, cam
 
 def _camera(view: CameraView) -> rrb.Spatial2DView:
     """The image of one camera, in pixels."""
-    import rerun.blueprint as rrb
-
     bounds = None
     if view.camera is not None:
         bounds = rrb.VisualBounds2D(x_range=[0, view.camera.width], y_range=[0, view.camera.height])
@@ -226,8 +198,6 @@ def _camera(view: CameraView) -> rrb.Spatial2DView:
 
 def _normalised(view: CameraView, session: Session) -> rrb.Spatial2DView:
     """Points of a camera without calibration, in normalised image coordinates."""
-    import rerun.blueprint as rrb
-
     points = [] if session.tracks is None else [session.tracks.xy_n]
     points += [] if session.matches is None else [session.matches.xy0_n, session.matches.xy1_n]
     low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
@@ -241,8 +211,6 @@ def _normalised(view: CameraView, session: Session) -> rrb.Spatial2DView:
 
 def _map(session: Session, extent: Extent) -> rrb.MapView:
     """Zoom so that the path fills most of a map 800 by 260 points (256-point tiles, Web Mercator)."""
-    import rerun.blueprint as rrb
-
     assert session.origin is not None
     width, height = (extent.high - extent.low)[:2]
     metres_a_point = max(width / 800.0, height / 260.0, 1e-3)
@@ -251,15 +219,13 @@ def _map(session: Session, extent: Extent) -> rrb.MapView:
     return rrb.MapView(name="Map", origin="/geo", zoom=zoom, background=rrb.MapProvider.OpenStreetMap)
 
 
-def _right(recorder: Recorder, solution: Solution | None, kind: str) -> View | None:
-    import rerun.blueprint as rrb
-
+def _right(recorder: Recorder, session: Session, solution: Solution | None, kind: str) -> View | None:
     def series(names: Names, first: str = "") -> list[View]:
         there = [(name, path) for name, path in names if recorder.has(path)]
         there.sort(key=lambda item: item[1] != first)
         return [series_view(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
 
-    raw = series(_SIGNALS)
+    raw = series(tuple((signal.title, signal.path) for signal in signals.signals_of(session)))
     # Without a solution every signal is shown at once.
     shown = _stack(raw, [2.0] * len(raw)) if solution is None else _tabs(series(_MOTION, _FIRST.get(kind, "")) + raw)
     states = (
@@ -318,8 +284,6 @@ def series_view(
     limits: tuple[float, float] | None = None,
 ) -> rrb.TimeSeriesView:
     """A plot over the whole recording."""
-    import rerun.blueprint as rrb
-
     return rrb.TimeSeriesView(
         name=name,
         origin="/",
@@ -332,9 +296,6 @@ def series_view(
 
 def log_columns() -> TextLogColumns:
     """Time, level and text: all lines come from one entity."""
-    from rerun.blueprint.archetypes import TextLogColumns
-    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
-
     return TextLogColumns(
         timeline_columns=[TimelineColumn("elapsed")],
         text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
@@ -343,8 +304,5 @@ def log_columns() -> TextLogColumns:
 
 def _whole() -> rrb.TimeAxis:
     """The whole recording, on the chosen time line."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     end = rr.TimeRangeBoundary.infinite()
     return rrb.TimeAxis(view_range=rr.TimeRange(start=end, end=end))

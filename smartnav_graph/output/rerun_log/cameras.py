@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
@@ -16,9 +16,6 @@ from smartnav_graph.output.rerun_log.recorder import Recorder
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision.images import Picture, pictures
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 MEDIA_TYPES = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}
 IMAGE_BYTES = 300_000_000
@@ -84,8 +81,6 @@ def log_cameras(recorder: Recorder, session: Session, found: list[CameraView], s
 
 def _log_frustum(recorder: Recorder, session: Session, view: CameraView, size: float) -> None:
     """The camera's mount on the body, and its pinhole model without distortion."""
-    import rerun as rr
-
     mount, camera = session.mount(view.name), view.camera
     there: list[rr.AsComponents] = []
     if view.root.startswith(BODY):
@@ -121,8 +116,6 @@ def _log_images(recorder: Recorder, session: Session, found: list[CameraView], e
 
 
 def _send_images(recorder: Recorder, path: str, shown: list[Picture], end_ns: int) -> None:
-    import rerun as rr
-
     for picture in shown:
         media = MEDIA_TYPES[picture.path.suffix.lower()]
         columns = rr.EncodedImage.columns(blob=[picture.path.read_bytes()], media_type=[media])
@@ -132,8 +125,6 @@ def _send_images(recorder: Recorder, path: str, shown: list[Picture], end_ns: in
 
 def _log_tracks(recorder: Recorder, session: Session, view: CameraView, end_ns: int) -> None:
     """Points of each image, coloured by track."""
-    import rerun as rr
-
     tracks = session.tracks
     assert tracks is not None
     xy, path = view.drawn(tracks.xy_n), f"{view.points}/tracks"

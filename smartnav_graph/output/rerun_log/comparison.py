@@ -8,9 +8,11 @@ the largest differences; /report.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.encodings import AbsoluteTimeRange
 
 from smartnav_graph.core.files import replacing
 from smartnav_graph.evaluation.compare import MEASURES, Comparison
@@ -18,9 +20,6 @@ from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, VEL, Solut
 from smartnav_graph.output.rerun_log import blueprint, colours, signals
 from smartnav_graph.output.rerun_log.recorder import Recorder, RecordingClock, fingerprint, recording_file
 from smartnav_graph.output.rerun_log.spatial import Extent, extent_around, finite_rows, nice, thinned
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 FIRST, SECOND = colours.ESTIMATE, [255, 160, 60]
 DIFFERENCE = [150, 150, 150]
@@ -86,8 +85,6 @@ def write_comparison(
 
 def _log_scene(recorder: Recorder, first: Solution, second: Solution, comparison: Comparison, extent: Extent) -> float:
     """Both paths, their positions at the chosen time, and the differences; returns the magnification of these."""
-    import rerun as rr
-
     recorder.style("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for name, solution, colour, width in (("first", first, FIRST, 2.2), ("second", second, SECOND, 1.2)):
         points = solution.nav_t_body - extent.shift
@@ -110,8 +107,6 @@ def _log_scene(recorder: Recorder, first: Solution, second: Solution, comparison
 
 def _log_plots(recorder: Recorder, comparison: Comparison, names: tuple[str, str]) -> None:
     """Differences with their bands, sigmas of both runs."""
-    import rerun as rr
-
     sigma = np.maximum(comparison.sigma_first, comparison.sigma_second)
     for path, _, part, factor, unit, lines in PLOTS:
         values, band = factor * comparison.difference[:, part], factor * sigma[:, part]
@@ -127,8 +122,6 @@ def _log_plots(recorder: Recorder, comparison: Comparison, names: tuple[str, str
 
 def _log_largest(recorder: Recorder, comparison: Comparison, extent: Extent) -> None:
     """The largest differences: marks in the scene, and lines of the log."""
-    import rerun as rr
-
     span = float(comparison.seconds[-1] - comparison.seconds[0])
     rows = comparison.largest(MARKED, max(MARKED_APART * span, 1e-9))
     metres, turns = comparison.magnitude(MEASURES[0])[rows], comparison.magnitude(MEASURES[4])[rows]
@@ -153,9 +146,6 @@ def _blueprint(
     recorder: Recorder, comparison: Comparison, names: tuple[str, str], extent: Extent, factor: float
 ) -> rrb.Blueprint:
     """The paths and the largest differences on the left, differences over time on the right."""
-    import rerun.blueprint as rrb
-    from rerun.encodings import AbsoluteTimeRange
-
     title = f"{names[0]} blue, {names[1]} orange, grey: their difference ×{factor:g}"
     scene = blueprint.world_view(title, extent, np.array([0.2, 0.35, -0.9]), [0.0, 0.0, 1.0])
     log = rrb.TextLogView(name="Largest differences: click a time", origin="/log", columns=blueprint.log_columns())

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, FactorGraphLayout
@@ -45,8 +46,6 @@ class GraphDrawing:
 
 def log_graph(recorder: Recorder, diagnostics: Diagnostics) -> None:
     """/graph: nodes and edges at evenly taken keyframes."""
-    import rerun as rr
-
     count = len(diagnostics.keyframe_ns)
     epochs = np.unique(np.linspace(0, count - 1, min(count, MOST_EPOCHS)).astype(int))
     pictures = list(_pictures(diagnostics.layout, epochs))

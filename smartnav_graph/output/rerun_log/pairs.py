@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from smartnav_graph.estimate.result.diagnostics import ImagePairs
@@ -37,8 +38,6 @@ def shown(seen: ImagePairs) -> NDArray[np.intp]:
 
 def log_pairs(recorder: Recorder, view: CameraView, seen: ImagePairs, end_ns: int) -> None:
     """Arrows from a point in the first image to the same in the second; counts; the use of each pair as status."""
-    import rerun as rr
-
     if not len(seen.pairs):
         return
     rows = shown(seen)
@@ -68,8 +67,6 @@ def _colours(seen: ImagePairs, rows: NDArray[np.intp]) -> NDArray[np.uint8]:
 
 def _log_counts(recorder: Recorder, seen: ImagePairs, rows: NDArray[np.intp], times: NDArray[np.int64]) -> None:
     """Matches in use and not in use of each pair shown, and why pairs are not used."""
-    import rerun as rr
-
     inside = seen.verdict == IN_USE
     used = np.bincount(seen.pairs.pair[seen.use & inside[seen.pairs.pair]], minlength=len(seen.pairs))[rows]
     counts = np.stack([used, seen.pairs.count[rows] - used], axis=1).astype(np.float64)

@@ -8,17 +8,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
+import rerun as rr
 from numpy.typing import ArrayLike, NDArray
+from rerun.chunk import RrdReader
 
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.estimate.result.diagnostics import window_of
 from smartnav_graph.output.rerun_log import colours
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 APPLICATION = "smartnav_graph"
 # Most tick labels of a small plot.
@@ -68,8 +67,6 @@ class RecordingClock:
 
     def columns(self, t_ns: ArrayLike) -> list[rr.TimeColumn]:
         """Index columns for rows at `t_ns` (n,)."""
-        import rerun as rr
-
         t = np.asarray(t_ns, dtype=np.int64)
         columns = [rr.TimeColumn("elapsed", duration=(t - self.t0_ns).astype("timedelta64[ns]"))]
         if self.is_date:
@@ -112,8 +109,6 @@ class Recorder:
 
     def states(self, path: str, t_ns: ArrayLike, states: Sequence[str]) -> None:
         """A status from each stamp on; only changes are written."""
-        import rerun as rr
-
         t = np.asarray(t_ns, dtype=np.int64)
         new = [i for i, state in enumerate(states) if i == 0 or state != states[i - 1]]
         self.rows(path, t[new], rr.StateChange.columns(state=[states[i] for i in new]))
@@ -128,8 +123,6 @@ class Recorder:
 
     def clear(self, path: str, t_ns: ArrayLike) -> None:
         """End the data of an entity at these times: no line may connect the two sides of an outage."""
-        import rerun as rr
-
         t = np.asarray(t_ns, dtype=np.int64)
         if len(t) and path in self.paths:
             cleared = rr.Clear.columns(is_recursive=np.zeros(len(t), dtype=bool))
@@ -172,8 +165,6 @@ def recording_file(path: Path, recording_id: str) -> Iterator[rr.RecordingStream
     OSError
         The file is not complete at the end.
     """
-    import rerun as rr
-
     # the default divides static rows into chunks by wall-clock time
     never = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=never)
@@ -189,8 +180,6 @@ def recording_file(path: Path, recording_id: str) -> Iterator[rr.RecordingStream
 
 def _finish(stream: rr.RecordingStream, path: Path) -> None:
     """Close the file and check that it is complete: the thread that writes it does not report a full disk."""
-    from rerun.chunk import RrdReader
-
     try:
         stream.flush()
         stream.disconnect()

@@ -7,6 +7,7 @@ joins to the first: two runs of the same session then have equal recordings.
 from __future__ import annotations
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from smartnav_graph.estimate.result.diagnostics import Updates
@@ -21,8 +22,6 @@ MOST_WINDOWS, MOST_POINTS = 2000, 60
 
 def log_causal(scene: SpatialLog, causal: Solution, updates: Updates | None) -> None:
     """The causal path, its latest point, and the window of each update."""
-    import rerun as rr
-
     scene.path("causal", causal.nav_t_body, colours.CAUSAL, 1.2)
     good = np.isfinite(causal.nav_t_body).all(axis=1)
     at = scene.local(causal.nav_t_body[good])
@@ -38,8 +37,6 @@ def log_causal(scene: SpatialLog, causal: Solution, updates: Updates | None) -> 
 
 def _log_windows(scene: SpatialLog, updates: Updates) -> None:
     """The keyframes that each update can change, after the update."""
-    import rerun as rr
-
     count = len(updates.t_ns)
     chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).astype(int))
     at = scene.local(updates.past)
@@ -56,8 +53,6 @@ def _some(start: int, end: int) -> NDArray[np.intp]:
 
 def log_updates(recorder: Recorder, updates: Updates) -> None:
     """Effort, rejections and change of earlier states of each update."""
-    import rerun as rr
-
     t = updates.t_ns
     effort = np.stack([updates.solved, updates.relinearised], axis=1).astype(np.float64)
     recorder.rows("/update/effort", t, rr.Scalars.columns(scalars=effort))
@@ -75,7 +70,5 @@ def log_updates(recorder: Recorder, updates: Updates) -> None:
 
 def log_latency(recorder: Recorder, updates: Updates) -> None:
     """Wall time of each update, ms: /update/latency."""
-    import rerun as rr
-
     recorder.rows("/update/latency", updates.t_ns, rr.Scalars.columns(scalars=updates.latency_ms))
     recorder.style("/update/latency", rr.SeriesLines(colors=colours.AXES[1], names="latency ms"))

@@ -2,45 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import MISSING
 from typing import NamedTuple
 
 import numpy as np
+import rerun as rr
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.evaluation import Evaluation
+from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Residuals, Solution
 from smartnav_graph.output.rerun_log import colours
 from smartnav_graph.output.rerun_log.events import stops
 from smartnav_graph.output.rerun_log.recorder import Recorder, readable
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.stream import Stream
 
+# Units of columns by the ends of their names.
+UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_ut": "µT", "_hpa": "hPa", "_c": "°C"}
 MARKER_SIZE = 2.0
 MANY = 500
 EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
 
 
+class Signal(NamedTuple):
+    """One quantity of a sampled stream: entity, title with unit, times (n,) ns, values (n,) or (n, 3)."""
+
+    path: str
+    title: str
+    t_ns: Times
+    values: Floats
+
+
+def signals_of(session: Session) -> list[Signal]:
+    """The sampled quantities of a session, in body axes and the units of their columns."""
+    found = []
+    for name, stream in session.streams().items():
+        quantities = [f for f in stream.specs() if f.default is MISSING and f.metadata["kind"] == "float"]
+        if stream.ABSOLUTE or not stream.UNIQUE_TIMES or name == "reference":
+            continue
+        for quantity in quantities:
+            several = len(quantities) > 1
+            column = quantity.metadata["columns"][0]
+            unit = next((text for suffix, text in UNITS.items() if column.endswith(suffix)), "")
+            title = f"{title_of(name)}{f' {quantity.name}' if several else ''} {unit}".strip()
+            path = f"/{name}/{quantity.name}" if several else f"/{name}"
+            found.append(Signal(path, title, stream.t_ns, getattr(stream, quantity.name)))
+    return found
+
+
 def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
-    """Raw signals, in body axes and SI units (magnetic field uT, pressure hPa, temperature deg C)."""
-    columns: list[tuple[str, Stream | None, str]] = [
-        ("/imu/accel", session.imu, "accel"),
-        ("/imu/gyro", session.imu, "gyro"),
-        ("/magnetometer", session.magnetometer, "field_ut"),
-        ("/barometer", session.barometer, "pressure_hpa"),
-        ("/temperature", session.temperature, "temperature_c"),
-        ("/velocity", session.velocity, "velocity"),
-        ("/wheel", session.wheel, "speed"),
-    ]
-    for path, stream, quantity in columns:
-        if stream is not None:
-            names = ["x", "y", "z"] if getattr(stream, quantity).ndim == 2 else [quantity]
-            _log_lines(recorder, path, stream.t_ns, getattr(stream, quantity), names)
-            recorder.clear(path, stops(stream.t_ns, end_ns))
+    """The raw signals."""
+    for signal in signals_of(session):
+        names = ["x", "y", "z"] if signal.values.ndim == 2 else [signal.path.removeprefix("/")]
+        _log_lines(recorder, signal.path, signal.t_ns, signal.values, names)
+        recorder.clear(signal.path, stops(signal.t_ns, end_ns))
 
 
 def _log_lines(recorder: Recorder, path: str, t_ns: Times, values: Floats, names: list[str]) -> None:
-    import rerun as rr
-
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
     recorder.style(path, rr.SeriesLines(colors=colours.of_axes(len(names)), names=names, widths=[1.0] * len(names)))
 
@@ -56,8 +74,6 @@ def log_bands(
     colors: list[list[int]] | None = None,
 ) -> None:
     """Lines with bands of one sigma, and at `path`/three_sigma of three: values and sigmas (n, k)."""
-    import rerun as rr
-
     colors = colors or colours.of_axes(len(names))
     for where, times in ((path, 1.0), (f"{path}/three_sigma", 3.0)):
         columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
@@ -88,8 +104,6 @@ def log_biases(recorder: Recorder, solution: Solution, evaluation: Evaluation | 
 
 def log_motion(recorder: Recorder, solution: Solution) -> None:
     """Speed, height, heading, pitch and roll."""
-    import rerun as rr
-
     t, angles = solution.t_ns, solution.heading_pitch_roll_deg
     speed = np.linalg.norm(solution.nav_v_body, axis=1)[:, None]
     _log_lines(recorder, "/motion/speed", t, speed, ["speed"])
@@ -190,8 +204,6 @@ def _log_axes(
 
 
 def _log_points(recorder: Recorder, path: str, t_ns: Times, values: Floats, marks: Marks) -> None:
-    import rerun as rr
-
     recorder.rows(path, t_ns, rr.Scalars.columns(scalars=values))
     if len(t_ns):
         shapes, sizes = [marks.shape] * len(marks.names), [marks.size] * len(marks.names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -119,8 +120,6 @@ class SpatialLog:
 
     def path(self, name: str, enu: Floats, colour: list[int], width: float) -> None:
         """A polyline at /world/<name>/path and /geo/<name>."""
-        import rerun as rr
-
         points, thickness = thinned(finite_rows(enu)), rr.Radius.ui_points(width)
         if len(points) < 2:
             return
@@ -133,8 +132,6 @@ class SpatialLog:
 
     def points(self, path: str, enu: Floats, colour: list[int], size: float, labels: list[str] | None = None) -> None:
         """Points at /world/<path> and /geo/<path>."""
-        import rerun as rr
-
         good = np.isfinite(enu).all(axis=1)
         if not good.any():
             return
@@ -152,8 +149,6 @@ class SpatialLog:
 
     def ellipsoids(self, path: str, t_ns: Times, enu: Floats, covariance: Floats, colour: list[int]) -> None:
         """The ellipsoid at the chosen time, at true size, at /world/<path>."""
-        import rerun as rr
-
         good = _known(covariance) & np.isfinite(enu).all(axis=1)
         half, quaternion = ellipsoids(covariance[good])
         columns = rr.Ellipsoids3D.columns(
@@ -182,8 +177,6 @@ def log_solution(scene: SpatialLog, solution: Solution) -> float:
 
 
 def _log_body(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp]) -> None:
-    import rerun as rr
-
     recorder, t = scene.recorder, solution.t_ns[rows]
     at = scene.local(solution.nav_t_body[rows])
     quaternion = Rotation.from_matrix(solution.nav_R_body[rows]).as_quat(canonical=True)
@@ -201,8 +194,6 @@ def _log_body(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp]) -> 
 
 def _log_covariance(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp]) -> float:
     """The ellipsoid at the chosen time, true size, and some along the path, magnified by a round factor."""
-    import rerun as rr
-
     covariance = solution.covariance[rows][:, POS, POS]
     scene.ellipsoids("est/covariance", solution.t_ns[rows], solution.nav_t_body[rows], covariance, colours.COVARIANCE)
     known = _known(covariance)
@@ -228,8 +219,6 @@ def _log_covariance(scene: SpatialLog, solution: Solution, rows: NDArray[np.intp
 
 def log_fixes(scene: SpatialLog, events: Events) -> None:
     """GNSS fixes by their use, the latest fix, and other positions."""
-    import rerun as rr
-
     session, recorder = scene.session, scene.recorder
     if session.gnss is not None:
         enu = session.nav_position(session.gnss)

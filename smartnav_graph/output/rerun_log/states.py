@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import rerun as rr
 
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.output.report.session_states import CLOCK, tables
@@ -17,8 +18,6 @@ def log_states(recorder: Recorder, states: Summary, updates: Updates | None, sta
 
     In a replay a clock offset is drawn as estimated at each update, and its final value at /clock/<sensor>/final.
     """
-    import rerun as rr
-
     for name in clocks(states):
         known = numbers_of(states, name)
         value, sigma = known["value"], known.get("sigma", 0.0)

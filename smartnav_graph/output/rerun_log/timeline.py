@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import rerun as rr
 
 from smartnav_graph.core.timebase import Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
@@ -70,8 +71,6 @@ def _log_state(recorder: Recorder, path: str, events: Events, spans: list[Gap], 
 
 def log_lines(recorder: Recorder, session: Session, events: Events, summary: Summary, notes: list[str]) -> None:
     """The log at /log: streams of the session, initialisation, warnings, gaps, outages, rejected fixes."""
-    import rerun as rr
-
     lines = [*_first_lines(session, events, summary, notes), *_event_lines(session, events)]
     lines.sort(key=lambda line: line[0])
     columns = rr.TextLog.columns(text=[text for _, _, text in lines], level=[level for _, level, _ in lines])
@@ -129,8 +128,6 @@ def _of_images(path: str) -> str:
 
 def log_report(recorder: Recorder, markdown: str | None) -> None:
     """The report at /report, and the meaning of the colours at /legend."""
-    import rerun as rr
-
     if markdown:
         recorder.static("/report", rr.TextDocument(markdown, media_type="text/markdown"))
     meaning = {path: text for path, text in _LEGEND.items() if recorder.has(path)}

@@ -11,9 +11,7 @@ from smartnav_graph.output.rerun_log import blueprint, recorder, spatial
 
 def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
     names = recording.view_names()
-    assert {"Report", "Map", "Accelerometer m/s²", "Gyroscope rad/s", "States", "Log", "Residuals GNSS (σ)"} <= set(
-        names
-    )
+    assert {"Report", "Map", "IMU accel m/s²", "IMU gyro rad/s", "States", "Log", "Residuals GNSS (σ)"} <= set(names)
     assert {"Position error m, bands 1σ 3σ", "Accelerometer bias m/s², bands 1σ 3σ", "Rotation error °"} <= set(names)
     assert {"Speed m/s", "Heading, pitch, roll °", "Height m", "Behind the body"} <= set(names)
     absent = ("Camera", "Points", "Magnetometer", "Updates", "Matches", "Factor graph", "States of the session")
@@ -23,7 +21,7 @@ def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
 def test_session_alone_shows_what_was_recorded(tmp_path):
     found = write(tmp_path / "s.rrd", solution=None, evaluation=None, summary=None, report_markdown=None)
     assert not [path for path in found.paths if path.startswith(("/world/est", "/bias", "/error", "/residuals"))]
-    left, right = {"Path (ENU)", "Legend", "Map"}, {"Accelerometer m/s²", "Gyroscope rad/s", "States", "Log"}
+    left, right = {"Path (ENU)", "Legend", "Map"}, {"IMU accel m/s²", "IMU gyro rad/s", "States", "Log"}
     assert set(found.view_names()) == left | right
     gap = found.texts("/status/imu", "StateChange:state")
     assert gap == ["recorded", "no samples", "recorded"]  # found in the stream itself

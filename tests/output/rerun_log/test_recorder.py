@@ -96,8 +96,8 @@ def test_existing_file_is_kept_without_force(tmp_path):
         write_recording(tmp_path / "run.rrd", session=make_session(), solution=None, force=False)
 
 
-def test_importing_the_package_does_not_load_rerun():
-    code = "import sys, smartnav_graph, smartnav_graph.output.rerun_log; print('rerun' in sys.modules)"
+def test_only_a_recording_loads_rerun():
+    code = "import sys, smartnav_graph.cli.runs, smartnav_graph.output.run_folder; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
