@@ -35,7 +35,7 @@ def second(first):
     )
 
 
-def test_what_was_planted_is_told(first, second):
+def test_what_was_planted_is_reported(first, second):
     found = compare(first, second)
     assert len(found) == len(first)
     assert found.statistics(BY_NAME["horizontal_m"]).statistics.p50 == pytest.approx(5.0)

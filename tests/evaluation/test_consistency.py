@@ -17,7 +17,7 @@ def test_nees_uses_correlations():
     assert nees([[1.0, 1.0]], P)[0] == pytest.approx(2.0 / 3.0)  # direction of the larger eigenvalue, 3
 
 
-def test_bad_covariances_are_told_as_nan():
+def test_bad_covariances_are_reported_as_nan():
     P = np.stack([np.eye(2), np.zeros((2, 2)), np.diag([1.0, -1.0]), np.full((2, 2), np.nan)])
     assert np.isnan(nees(np.ones((4, 2)), P)).tolist() == [False, True, True, True]
 
@@ -31,7 +31,7 @@ def test_published_chi_square_values():
 
 
 @pytest.mark.parametrize(("scale", "inside"), [(1.0, True), (2.0, False), (0.5, False)])
-def test_average_nees_tells_honest_from_wrong_covariance(scale, inside):
+def test_average_nees_separates_consistent_from_wrong_covariance(scale, inside):
     rng = np.random.default_rng(3)
     A = rng.normal(size=(3, 3))
     P = A @ A.T + 0.1 * np.eye(3)

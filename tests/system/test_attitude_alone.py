@@ -69,12 +69,12 @@ def test_without_the_magnetometer_north_stays_open():
 
 
 def test_a_magnetometer_turned_over_is_not_believed_blindly():
-    """Readings with two axes of the wrong sign fit no field: the rows are far outside of their sigma, and told."""
+    """Readings with two axes of the wrong sign fit no field: the rows are far outside of their sigma, and reported."""
     session = walk(1)
     wrong = session.magnetometer.field_ut * [1.0, -1.0, -1.0]
     run = sn.run(session.replace(magnetometer=replace(session.magnetometer, field_ut=wrong)), initial=OPEN)
     residuals = run.solution.residuals
     rows = residuals.of("magnetometer")
-    honest = sn.run(session, initial=OPEN).solution.residuals
-    there = honest.of("magnetometer")
-    assert np.square(residuals.whitened[rows]).mean() > 3.0 * np.square(honest.whitened[there]).mean()
+    consistent = sn.run(session, initial=OPEN).solution.residuals
+    there = consistent.of("magnetometer")
+    assert np.square(residuals.whitened[rows]).mean() > 3.0 * np.square(consistent.whitened[there]).mean()

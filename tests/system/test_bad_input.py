@@ -1,4 +1,4 @@
-"""Bad and poor recordings, from the session to the run: a clear error, or a result that tells what it rests on."""
+"""Bad and poor recordings, from the session to the run: a clear error, or a result that reports what it is based on."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_fixes_all_outside_the_inertial_span(eight):
     assert "one clock" in str(e.value)
 
 
-def test_fixes_partly_outside_are_counted_and_told(eight):
+def test_fixes_partly_outside_are_counted_and_reported(eight):
     run = sn.run(shifted(eight, -20.0), start_s=0.0)
     assert run.summary["dropped"] == {"gnss": {"outside the inertial span": 20}}
     assert any("20 of 60 rows lie outside the imu's span" in text for text in run.summary["warnings"])
@@ -122,15 +122,15 @@ def test_a_stretch_without_fixes_is_no_start(eight):
 
 
 @pytest.mark.parametrize(
-    ("field", "factor", "told"),
+    ("field", "factor", "reported"),
     [("accel", 1 / 9.81, "units of g"), ("accel", 9.81, "scaled by 9.81 twice"), ("gyro", 57.2958, "deg/s")],
 )
-def test_wrong_units_are_told(eight, field, factor, told):
-    """Smoothed with a warning; or refused with a pointer to `info`, which tells. Never passed over."""
+def test_wrong_units_are_reported(eight, field, factor, reported):
+    """Smoothed with a warning; or refused with a pointer to `info`, which reports it. Never passed over."""
     wrong = with_imu(eight, **{field: getattr(eight.imu, field) * factor})
     with contextlib.suppress(SolverError):
-        assert any(told in text for text in sn.run(wrong).summary["warnings"])
-    assert any(told in text for text in inspect(wrong).warnings())
+        assert any(reported in text for text in sn.run(wrong).summary["warnings"])
+    assert any(reported in text for text in inspect(wrong).warnings())
 
 
 @pytest.mark.parametrize("field", ["accel", "gyro"])
@@ -140,7 +140,7 @@ def test_a_dead_inertial_sensor_is_refused(eight, field):
         sn.smooth(dead)
 
 
-def test_repeated_fixes_are_told(eight):
+def test_repeated_fixes_are_reported(eight):
     stuck = with_gnss(eight, lla=np.tile(eight.gnss.lla[0], (60, 1)))
     assert any("in all 60 rows" in text for text in sn.run(stuck).summary["warnings"])
 
@@ -155,7 +155,7 @@ def test_a_value_that_is_no_number_is_refused_by_name(eight):
 # ---- gaps
 
 
-def test_a_gap_is_told_and_its_uncertainty_grows(eight, clean):
+def test_a_gap_is_reported_and_its_uncertainty_grows(eight, clean):
     run = sn.run(degrade(eight, Degrade(drop_imu=((30.4, 3.0),)), 0))
     (gap,) = run.summary["gaps"]
     assert gap["kind"] == "missing" and gap["start_s"] == 30.39 and gap["length_s"] == pytest.approx(3.01)
@@ -188,7 +188,7 @@ def test_repaired_faults_cost_little(eight, clean, tmp_path):
     assert any(text.startswith("imu: ") and "6 rows non-finite" in text for text in run.summary["warnings"])
 
 
-# ---- poor geometry: no crash, honest heading
+# ---- poor geometry: no crash, consistent heading
 
 
 @pytest.mark.parametrize("rows", [[10], [10, 19], [10, 20, 30]])
@@ -263,7 +263,7 @@ def test_every_fix_rejected_is_an_error(eight, monkeypatch):
 
 
 def test_a_start_ten_kilometres_off_ends_at_the_same_solution(eight):
-    """Sigmas of 100 km and 180 deg: the prior holds nothing, wherever it stands."""
+    """Sigmas of 100 km and 180 deg: the prior has no weight, whatever its value."""
     near, far = (sn.smooth(eight, initial=f"{start},0,1e5,180") for start in ("0,0,0", "7000,-7000,300"))
     assert np.linalg.norm(near.nav_t_body - far.nav_t_body, axis=1).max() < 1e-3  # m
     assert turned_deg(near.nav_R_body, far.nav_R_body).max() < 5e-3

@@ -47,7 +47,7 @@ def test_images_hold_what_inertial_data_lose(room, seen):
     assert metres < 0.02 * without[0] and degrees < 0.5 * without[1]
 
 
-def test_the_covariance_is_honest(room, seen):
+def test_the_covariance_is_consistent(room, seen):
     rows = np.isin(room.reference.t_ns, seen.solution.t_ns)
     at = np.searchsorted(seen.solution.t_ns, room.reference.t_ns[rows])
     error = seen.solution.nav_t_body[at] - room.reference.enu[rows]
@@ -99,7 +99,7 @@ def test_a_tracker_that_slips_as_a_whole_is_found(room, seen):
 
 
 def test_images_of_something_else_are_refused(room):
-    """Tracks that have nothing to do with the motion: refused and told, and the result is that without images."""
+    """Tracks that have nothing to do with the motion: refused and reported, and the result is that without images."""
     rng = np.random.default_rng(0)
     noise = room.replace(tracks=replace(room.tracks, xy_n=rng.uniform(-0.5, 0.5, room.tracks.xy_n.shape), xy_px=None))
     run, alone = smooth(noise, options()), smooth(room, options(image_pairs={"enabled": False}))
@@ -109,7 +109,7 @@ def test_images_of_something_else_are_refused(room):
 
 
 def test_camera_states_find_what_is_wrong(room):
-    """Boresight off by half a degree and clock by 15 ms, told with sigmas: found."""
+    """Boresight off by half a degree and clock by 15 ms, reported with sigmas: found."""
     mount = room.sensors["camera"] if "camera" in room.sensors else next(iter(room.sensors.values()))
     name = next(key for key, value in room.sensors.items() if value is mount)
     off = np.radians([0.4, -0.3, 0.2])

@@ -1,4 +1,4 @@
-"""Outlying fixes and broken rows on the drive that comes with gtsam; every rejection told."""
+"""Outlying fixes and broken rows on the drive that comes with gtsam; every rejection reported."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def rms(drive, solution) -> float:
     return float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean()))
 
 
-def assert_told_apart(drive, kind: str, seed: int, vehicle: str = "none", loss: str = "gate") -> None:
+def assert_separated(drive, kind: str, seed: int, vehicle: str = "none", loss: str = "gate") -> None:
     bad, good, mask = faulty(drive, kind, seed)
     config = Config(gnss=GnssConfig(loss=loss))
     run, clean = (sn.run(session, config, vehicle=vehicle) for session in (bad, good))
@@ -54,27 +54,27 @@ def test_among_fixes_of_centimetres_too(kitti, kind, seed):
     """No loss as narrow as these fixes finds the way that inertial data foretell to metres."""
     bad = degrade(kitti, Degrade(outliers=KINDS[kind]), seed)
     mask = np.asarray(bad.gnss.extra["is_outlier"]) == 1
-    told = np.zeros(len(mask), dtype=bool)
-    told[[one["row"] for one in sn.run(bad).summary["rejections"]]] = True
-    assert (told | ~mask).all() and (told & ~mask).sum() <= 2
+    reported = np.zeros(len(mask), dtype=bool)
+    reported[[one["row"] for one in sn.run(bad).summary["rejections"]]] = True
+    assert (reported | ~mask).all() and (reported & ~mask).sum() <= 2
 
 
-def test_a_fifth_of_outliers_is_told_apart(kitti):
-    assert_told_apart(kitti, "a fifth", 2)  # the first fix is one of them
+def test_a_fifth_of_outliers_is_separated(kitti):
+    assert_separated(kitti, "a fifth", 2)  # the first fix is one of them
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["none", "car"])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", KINDS)
-def test_outliers_are_told_apart(kitti, kind, seed, vehicle):
-    assert_told_apart(kitti, kind, seed, vehicle)
+def test_outliers_are_separated(kitti, kind, seed, vehicle):
+    assert_separated(kitti, kind, seed, vehicle)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_graduated_non_convexity_tells_them_apart_too(kitti, kind):
-    assert_told_apart(kitti, kind, 1, loss="gnc")
+    assert_separated(kitti, kind, 1, loss="gnc")
 
 
 @pytest.mark.slow
@@ -108,12 +108,12 @@ def rejecting():
     return session, sn.run(with_gnss(session, lla=lla)).summary
 
 
-def test_a_rejection_is_told_with_time_sensor_and_size(rejecting):
+def test_a_rejection_is_reported_with_time_sensor_and_size(rejecting):
     session, summary = rejecting
-    (told,) = summary["rejections"]
-    assert told["sensor"] == "gnss" and told["row"] == 30
-    assert told["t_s"] == pytest.approx(float(session.seconds(session.gnss.t_ns[30])), abs=1e-3)
-    assert told["size_m"] == pytest.approx(80.0, abs=4.0) and told["size_sigma"] == pytest.approx(80.0, abs=4.0)
+    (reported,) = summary["rejections"]
+    assert reported["sensor"] == "gnss" and reported["row"] == 30
+    assert reported["t_s"] == pytest.approx(float(session.seconds(session.gnss.t_ns[30])), abs=1e-3)
+    assert reported["size_m"] == pytest.approx(80.0, abs=4.0) and reported["size_sigma"] == pytest.approx(80.0, abs=4.0)
     assert json.loads(json.dumps(summary["rejections"])) == summary["rejections"]
 
 

@@ -32,7 +32,7 @@ def test_steps_and_inertial_data_beat_a_straight_line(trace, every, share):
     assert run.summary["initialisation"]["starts"] == 1
 
 
-def test_a_walk_that_nobody_declared_is_told():
+def test_a_walk_that_nobody_declared_is_reported():
     session = Scenario("walk", 40.0, motions.walk, "none", "galaxy-s2")(1)
     t_ns = session.imu.t_ns[[600, 1800, 3000]]
     place = interpolate(t_ns, session.reference.t_ns, session.reference.enu)

@@ -1,6 +1,6 @@
 """The drive that comes with gtsam: the figures that the package promises, and that they hang on the holes it finds.
 
-Behind each bound stands what is measured today.
+The bounds are somewhat above the values measured today.
 """
 
 from __future__ import annotations
@@ -169,9 +169,9 @@ def test_replay_covers_the_drive_and_tells_its_delay(kitti, batch, replayed):
 
 
 def test_eight_minutes_of_dead_reckoning_end_with_a_sigma_that_says_so(kitti):
-    told = sn.run(kitti, sensors=("-gnss",), initial="0,0,0,60")
-    assert told.summary["mode"] == "dead-reckoning"
-    horizontal = np.hypot(*told.solution.sigmas[:, 3:5].T)
+    reported = sn.run(kitti, sensors=("-gnss",), initial="0,0,0,60")
+    assert reported.summary["mode"] == "dead-reckoning"
+    horizontal = np.hypot(*reported.solution.sigmas[:, 3:5].T)
     assert horizontal[0] == pytest.approx(10.0 * np.sqrt(2.0), rel=0.01)  # the default of --initial
     assert horizontal[-1] > 1e4  # m: an unlevelled phone-class sensor knows nothing after so long
     assert (np.diff(horizontal) > 0).all()

@@ -67,18 +67,18 @@ def test_a_model_holds_the_trajectory(workshop, capsys):
     assert match(folder) == 1
     assert "no gnss fixes to align a map" in capsys.readouterr().err
     assert match(folder, "--known", f"{folder}/without", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["used"] == told["aligned"] == len(room.images) // EVERY and told["unknown"] == 0
-    assert told["metres_a_unit"] == pytest.approx(1 / SCALE, rel=0.02)
-    assert 0.005 < told["sigma_m"] < 0.05  # m: of the model, and of what the run strays
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["used"] == reported["aligned"] == len(room.images) // EVERY and reported["unknown"] == 0
+    assert reported["metres_a_unit"] == pytest.approx(1 / SCALE, rel=0.02)
+    assert 0.005 < reported["sigma_m"] < 0.05  # m: of the model, and of the drift of the run
     fixes = sn.load(f"{folder}/room").pose_fixes
     assert set(fixes.source) == {"colmap"}
 
     assert match(folder, "--known", f"{folder}/without") == 1
     assert "exists already; expected a session without it; add --force" in capsys.readouterr().err
     assert match(folder, "--known", f"{folder}/without", "--force") == 0
-    told = capsys.readouterr().out
-    assert f"{len(fixes)} images of the session" in told and "one unit of the model is 4.7" in told
+    reported = capsys.readouterr().out
+    assert f"{len(fixes)} images of the session" in reported and "one unit of the model is 4.7" in reported
 
     arguments = ["smooth", f"{folder}/room", "--quiet", "--sensors", "pose_fixes", "--out", f"{folder}/alone"]
     assert main(arguments) == 0
@@ -112,8 +112,8 @@ def test_fixes_of_others_are_not_lost(workshop, capsys, tmp_path):
     for source in (None, np.array(["total station"], dtype=object)):
         fixes = PoseFix(t_ns=room.images.t_ns[:1], enu=np.zeros((1, 3)), source=source)
         save_session(room.replace(pose_fixes=fixes), tmp_path / "room", force=True)
-        told = ["match", f"{tmp_path}/room", "--map", f"{folder}/model", "--known", f"{folder}/without", "--force"]
-        assert main(told) == 1
+        reported = ["match", f"{tmp_path}/room", "--map", f"{folder}/model", "--known", f"{folder}/without", "--force"]
+        assert main(reported) == 1
         assert "which --force would lose" in capsys.readouterr().err
         assert len(sn.load(f"{tmp_path}/room").pose_fixes) == 1
 

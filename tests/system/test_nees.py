@@ -1,4 +1,4 @@
-"""Is the covariance honest? Average NEES over fixed seeds, against 99.8 % chi-square bounds (Bar-Shalom 2001, 5.4)."""
+"""Consistency of the covariance: average NEES over fixed seeds, against 99.8 % bounds (Bar-Shalom 2001, 5.4)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def average_nees(make: Callable[[int], Session], seeds: int = 30) -> dict[tuple[
 
 
 def outside(averages: dict[tuple[str, float], float], seeds: int = 30) -> dict[tuple[str, float], float]:
-    """The averages that an honest covariance would not give."""
+    """The averages that a consistent covariance would not give."""
     bad = {}
     for (name, fraction), value in averages.items():
         dof = PARTS[name].stop - PARTS[name].start
@@ -105,7 +105,7 @@ ALONE: dict[str, Callable[[int], Session]] = {
     "velocity": in_hand(gnss=SHARP, velocity=SpeedModel(sigma_m_s=0.1)),
     "gnss velocity": in_hand(gnss=GnssModel(white_m=3.0, velocity_m_s=0.1)),
     "gnss clock": in_hand(gnss=GnssModel(white_m=0.3, offset_s=0.1)),
-    "gnss wander": in_hand(gnss=GnssModel(white_m=1.0, markov_m=3.0, markov_s=30.0)),
+    "correlated gnss error": in_hand(gnss=GnssModel(white_m=1.0, markov_m=3.0, markov_s=30.0)),
     "steps": on_foot(gnss=SPARSE),
     "all in a car": partial(sn.simulate, "car-all-2min"),
     "all on foot": partial(sn.simulate, "walk-all-2min"),
@@ -204,8 +204,8 @@ def test_halved_inertial_noise_is_caught():
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["phone-car-5min", "car-10min"])
 def test_long_drives(scenario):
-    """The phone's fixes wander by 4 m in a minute: its positions are as honest as those of white fixes. Velocities are
-    better than they say where a car slips less than its constraint allows for."""
+    """Positions are as consistent with correlated GNSS errors (4 m, 60 s) as with white ones. Velocities are better
+    than their sigmas where a car slips less than its constraint allows for."""
     bad = outside(average_nees(lambda seed: sn.simulate(scenario, seed)))
     assert {which for which, value in bad.items() if which[0] != "velocity" or value > 1.0} == set()
 

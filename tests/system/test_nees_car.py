@@ -1,4 +1,4 @@
-"""Is the covariance of a car honest with the vehicle constraint, the wheels and measured velocities, each alone?"""
+"""Is the covariance of a car consistent with the vehicle constraint, the wheels and measured velocities, each alone?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is the covariance honest where standstills hold the trajectory? See `test_nees` for the bounds."""
+"""Is the covariance consistent where standstills hold the trajectory? See `test_nees` for the bounds."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ def with_points(seed: int) -> Session:
 
 
 def outside(averages: dict[tuple[str, float], float], seeds: int) -> dict[tuple[str, float], float]:
-    """Averages that an honest covariance would not give. A rest claims a centimetre a second, and no turn to within the
-    noise, where this trolley has none at all: velocities and gyro biases are allowed to be better than they say."""
+    """Averages that a consistent covariance would not give. At a rest the sigmas are a centimetre per second and the
+    noise of the gyro, but this trolley does not move at all: velocities and gyro biases may be better than their
+    sigmas."""
     bad = {}
     for (name, fraction), value in averages.items():
         dof = PARTS[name].stop - PARTS[name].start

@@ -1,6 +1,6 @@
-"""Twenty minutes with a trolley by inertial data and standstills alone: how far off, and honest about it?
+"""Twenty minutes with a trolley by inertial data and standstills alone: how far off, and consistent about it?
 
-The start is known (at rest in the origin, facing north); nothing else tells a position. What vision adds is measured
+The start is known (at rest in the origin, facing north); nothing else measures a position. What vision adds is measured
 against these.
 """
 
@@ -41,12 +41,12 @@ def test_every_run_stays_within_bounds(seed):
 
 
 @pytest.mark.slow
-def test_covariances_are_honest_over_thirty_runs():
+def test_covariances_are_consistent_over_thirty_runs():
     assert outside(average_nees(alone)) == {}
 
 
 @pytest.mark.slow
-def test_a_gyro_that_drifts_more_than_told_is_caught():
+def test_a_gyro_that_drifts_more_than_stated_is_caught():
     def bold(seed: int) -> sn.Session:
         session = alone(seed)
         noise = replace(session.calibration.imu_noise, gyro_bias_walk=2e-6)

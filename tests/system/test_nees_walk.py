@@ -1,4 +1,4 @@
-"""Is the covariance of a walk honest with steps alone, and with a barometer alone, beside a few points?"""
+"""Is the covariance of a walk consistent with steps alone, and with a barometer alone, beside a few points?"""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def test_barometer_alone():
     assert outside(average_nees(with_barometer, SEEDS), SEEDS) == {}
 
 
-def test_pressure_that_walks_more_than_told_is_caught():
+def test_pressure_that_walks_more_than_stated_is_caught():
     def bold(seed: int) -> Session:
         session = walk(seed, 5.0, (0.1, 0.1, 5.0), BarometerModel(walk_hpa=0.03))
-        told = replace(session.calibration.barometer_noise, pressure_walk=0.001, pressure_sigma=0.01)
-        return session.replace(calibration=replace(session.calibration, barometer_noise=told))
+        reported = replace(session.calibration.barometer_noise, pressure_walk=0.001, pressure_sigma=0.01)
+        return session.replace(calibration=replace(session.calibration, barometer_noise=reported))
 
     bad = outside(average_nees(bold, 6), 6)
     assert min(bad["velocity", fraction] for fraction in (0.1, 0.5, 0.9)) > 4.0

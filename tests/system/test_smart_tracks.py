@@ -1,4 +1,4 @@
-"""Tracks as points in space in whole runs: they follow on image pairs, are judged, and say what they did."""
+"""Tracks as points in space in whole runs: they follow on image pairs, are tested, and report it."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_tracks_hold_at_least_what_pairs_hold(room, run):
     assert metres < 1.1 * pairs[0]  # 0.020 beside 0.030 m
 
 
-def test_the_covariance_is_honest(room, run):
+def test_the_covariance_is_consistent(room, run):
     rows = np.isin(room.reference.t_ns, run.solution.t_ns)
     at = np.searchsorted(run.solution.t_ns, room.reference.t_ns[rows])
     error = run.solution.nav_t_body[at] - room.reference.enu[rows]
@@ -101,7 +101,7 @@ def test_tracks_of_something_else_are_refused(room):
 
 
 def test_without_pairs_tracks_are_judged_by_the_rest_alone(room):
-    """Half a minute of a phone's accelerometer is too poor: refused, and told."""
+    """Half a minute of a phone's accelerometer is too poor: refused, and reported."""
     found = smooth(room, options(image_pairs={"enabled": False}))
     assert any("smart: refused, only" in text for text in found.summary["warnings"])
     assert "smart" not in found.summary["factors"] and found.summary["rejected"].get("smart") is None

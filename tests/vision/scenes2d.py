@@ -29,7 +29,7 @@ def texture(seed: int = 0, size: int = 900, grain: float = 1.5) -> np.ndarray:
 
 
 def seen(plane: np.ndarray, H: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """The picture (h, w) in which plane pixel p stands at H p."""
+    """The picture (h, w) in which plane pixel p appears at H p."""
     return cv2.warpPerspective(plane, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR)
 
 

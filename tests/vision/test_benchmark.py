@@ -31,7 +31,7 @@ def points(t: np.ndarray, count: int = 400, noise_px: float = 0.0, seed: int = 0
     return tuple(X[:, :2] / X[:, 2:] + rng.normal(0, noise_px / F, (count, 2)) for X in (X0, X1))
 
 
-def judged(t: np.ndarray, *xy: np.ndarray, turn: np.ndarray = R) -> tuple[np.ndarray, np.ndarray]:
+def classified(t: np.ndarray, *xy: np.ndarray, turn: np.ndarray = R) -> tuple[np.ndarray, np.ndarray]:
     m = len(xy[0])
     return true_matches(np.tile(turn, (m, 1, 1)), np.tile(t, (m, 1)), *xy, F)
 
@@ -39,15 +39,15 @@ def judged(t: np.ndarray, *xy: np.ndarray, turn: np.ndarray = R) -> tuple[np.nda
 @pytest.mark.parametrize("t", [T, np.zeros(3), 1e-4 * T])
 def test_exact_matches_are_true_and_swapped_ones_are_not(t):
     x0, x1 = points(t)
-    good, weak = judged(t, x0, x1)
+    good, weak = classified(t, x0, x1)
     assert good.all() and weak.all() == (np.linalg.norm(t) < 0.01) and weak.all() == weak.any()
-    assert judged(t, x0, np.roll(x1, 7, axis=0))[0].mean() < 0.05
+    assert classified(t, x0, np.roll(x1, 7, axis=0))[0].mean() < 0.05
 
 
 def test_pixel_noise_of_half_a_pixel_passes_and_of_five_does_not():
-    good, _ = judged(T, *points(T, noise_px=0.5))
+    good, _ = classified(T, *points(T, noise_px=0.5))
     assert good.mean() > 0.97  # Sampson distance: sigma 0.5 px
-    good, _ = judged(T, *points(T, noise_px=5.0))
+    good, _ = classified(T, *points(T, noise_px=5.0))
     assert good.mean() < 0.35
 
 
@@ -61,15 +61,15 @@ def test_pixel_noise_of_half_a_pixel_passes_and_of_five_does_not():
     ],
 )
 def test_a_wrong_pose_finds_few_true_matches(t, turn):
-    assert judged(t, *points(T), turn=turn)[0].mean() < 0.3
+    assert classified(t, *points(T), turn=turn)[0].mean() < 0.3
 
 
 def test_without_a_baseline_the_epipolar_test_would_accept_a_whole_line():
     x0, x1 = points(np.zeros(3))
     slid = x1 + np.array([30 / F, 0])
-    good, weak = judged(np.zeros(3), x0, slid)
+    good, weak = classified(np.zeros(3), x0, slid)
     assert weak.all() and not good.any()
-    good, weak = judged(np.array([0.02, 0.0, 0.0]), *points(np.array([0.02, 0.0, 0.0])))
+    good, weak = classified(np.array([0.02, 0.0, 0.0]), *points(np.array([0.02, 0.0, 0.0])))
     assert good.all() and not weak.any()  # 3 px of parallax at 3 m
 
 
@@ -97,7 +97,7 @@ def test_camera_poses_have_lever_arm_mount_and_clock(tmp_path, offset_s):
 
 
 def wall(folder, sign: float = 1.0) -> sn.Session:
-    """A camera that walks along a wall 2 m ahead, and turns; `sign` -1 tells the reference the wrong turn."""
+    """A camera that walks along a wall 2 m ahead, and turns; `sign` -1 gives the reference the wrong turn."""
     reference, mount = walked()
     plane = texture(seed=2, size=1400)
     pictures = []
@@ -122,13 +122,13 @@ def test_the_score_of_a_wall(tmp_path):
     assert found.true_rate > 0.97 and found.useful_pairs == 1.0
     assert 60 < found.median_true <= found.median_matches <= 300
     assert found.ms_picture > 0 and found.ms_pair > 0
-    told = found.to_dict()
-    assert told["thesis"] == {"true_rate": 0.8499, "useful_pairs": 0.6111, "seconds": 1.0}
+    reported = found.to_dict()
+    assert reported["thesis"] == {"true_rate": 0.8499, "useful_pairs": 0.6111, "seconds": 1.0}
     wrong = score_features(wall(tmp_path / "wrong", sign=-1.0), config)
     assert wrong.matches == found.matches and wrong.true_rate < 0.5
 
 
-def test_pairs_outside_the_reference_are_told(tmp_path):
+def test_pairs_outside_the_reference_are_reported(tmp_path):
     session = wall(tmp_path / "s")
     short = session.replace(reference=session.reference.take(slice(0, 13)))  # 0.6 s
     found = score_features(short, FrontEndConfig(count=200, spans=(1,), rate_hz=0.0))

@@ -1,4 +1,4 @@
-"""Pictures -> matches and tracks: which pairs, what is skipped and told, the same whatever the number of threads."""
+"""Pictures -> matches and tracks: which pairs, what is skipped and reported, the same for any number of threads."""
 
 import threading
 import time
@@ -61,7 +61,7 @@ def test_neighbours_always_match_and_wider_pairs_within_the_time(plain):
     assert set(zip(matches.image_id_0.tolist(), matches.image_id_1.tolist(), strict=True)) == {(10, 15)}
 
 
-def test_the_rate_thins_and_is_told(plain):
+def test_the_rate_thins_and_is_reported(plain):
     report = run_front_end(plain, FrontEndConfig(count=200, rate_hz=2.0)).report
     assert (report.used, report.thinned) == (5, 5)
     assert "5 of 10 used, 5 left out to keep the rate; longest break 0.50 s" in report.to_text()
@@ -74,7 +74,7 @@ def test_the_policy_of_the_thesis_keeps_fifteen(plain):
     assert matches.score.min() == 1.0 and matches.score.max() <= 3.0
 
 
-def test_every_fault_is_skipped_counted_and_told(tmp_path):
+def test_every_fault_is_skipped_counted_and_reported(tmp_path):
     faulty = list(PICTURES)
     faulty[2] = None
     faulty[3] = png(PICTURES[3])[:2000]
@@ -221,7 +221,7 @@ def test_tracks_of_a_public_recording(dataset):
     found = run_front_end(readers.read(dataset("euroc_v101")), FrontEndConfig(features="klt"))
     assert found.report.used == 6 and found.report.blind == 0
     assert found.report.tracks == pytest.approx(300, abs=15)
-    # it stands still: corners stay within the shiver of the motors
+    # it is still: corners stay within the shiver of the motors
     tracks = found.tracks
     for track in np.unique(tracks.track_id)[:50]:
         seen_at = tracks.xy_px[tracks.track_id == track]

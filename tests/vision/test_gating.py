@@ -1,4 +1,4 @@
-"""Matches judged by a turn that is known: outliers out, good ones in, and no pair that fits its own wrong motion."""
+"""Matches tested by a turn that is known: outliers out, good ones in, and no pair that fits its own wrong motion."""
 
 import numpy as np
 import pytest

@@ -129,7 +129,7 @@ def test_the_longest_break_counts_the_ends(tmp_path):
     assert images.longest_break_s(rows, []) == 9.0
 
 
-def test_a_session_without_pictures_is_told(tmp_path):
+def test_a_session_without_pictures_is_reported(tmp_path):
     with pytest.raises(SessionError, match="has no images"):
         images.pictures(Session())
     session = session_of([PICTURE], tmp_path / "s")

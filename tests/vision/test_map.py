@@ -209,7 +209,7 @@ def test_a_real_model_agrees_with_its_own_text(dataset):
 
 
 def test_the_antenna_stands_beside_the_camera():
-    """Fixes of a receiver: laid on where its antenna was, told for the body."""
+    """Fixes of a receiver: laid on where its antenna was, reported for the body."""
     arm = (0.3, -0.8, 1.1)
     t, R = truth()
     at_antenna = known(t + R @ np.array(arm))

@@ -103,6 +103,6 @@ def test_broken_rows_name_file_and_row(file, row, parts):
         assert part in str(caught.value)
 
 
-def test_a_missing_file_is_told(tmp_path):
+def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(SessionError, match="is missing"):
         match_file.read_match_file(tmp_path / "none.txt")

@@ -109,8 +109,8 @@ def test_the_command_makes_and_keeps_matches(folder, capsys):
     code, out, _ = call(capsys, "match", folder, "--features", "akaze")
     assert code == 0 and "read from an earlier call" in out
     code, out, _ = call(capsys, "match", folder, "--features", "akaze", "--json")
-    told = json.loads(out)
-    assert told["computed"] is False and told["pairs"] == 5 and told["skipped"] == {}
+    reported = json.loads(out)
+    assert reported["computed"] is False and reported["pairs"] == 5 and reported["skipped"] == {}
 
 
 def test_match_files_go_out_and_in(folder, tmp_path, capsys):

@@ -31,22 +31,24 @@ def test_the_simplest_that_explains_is_chosen(rng, truth):
 
 
 def test_a_deviation_from_what_was_known_counts(rng):
-    told = models(rng, truth="static")
-    turned = told | {"static": ModelFit(told["static"].square, 100.0)}
-    assert select_model(told) == "static" and select_model(turned) == "rotation"
+    reported = models(rng, truth="static")
+    turned = reported | {"static": ModelFit(reported["static"].square, 100.0)}
+    assert select_model(reported) == "static" and select_model(turned) == "rotation"
 
 
 def test_a_sigma_stated_too_large_lets_no_plane_pass_for_depth(rng):
-    told = models(rng, truth="general", variance=0.1, miss=1.0)
-    assert noise_variance(told["general"].square) == pytest.approx(0.2, abs=0.05)
-    told |= {kind: ModelFit(np.full(200, 50.0)) for kind in ("static", "rotation")}
-    assert select_model(told) == "general"
-    assert select_model(told | {"general": ModelFit(told["general"].square * 10.0)}) == "planar"  # the noise as stated
+    reported = models(rng, truth="general", variance=0.1, miss=1.0)
+    assert noise_variance(reported["general"].square) == pytest.approx(0.2, abs=0.05)
+    reported |= {kind: ModelFit(np.full(200, 50.0)) for kind in ("static", "rotation")}
+    assert select_model(reported) == "general"
+    assert (
+        select_model(reported | {"general": ModelFit(reported["general"].square * 10.0)}) == "planar"
+    )  # the noise as stated
 
 
 def test_whether_there_is_a_baseline_is_judged_by_the_sigma_stated(rng):
-    told = models(rng, truth="general", variance=0.1, miss=0.6)
-    assert select_model({**told, "planar": ModelFit(np.full(200, 50.0))}) in ("static", "rotation")
+    reported = models(rng, truth="general", variance=0.1, miss=0.6)
+    assert select_model({**reported, "planar": ModelFit(np.full(200, 50.0))}) in ("static", "rotation")
 
 
 @pytest.mark.parametrize("n", [12, 60, 600])

@@ -88,14 +88,14 @@ def test_a_tracker_turns_the_gyroscope_into_the_cameras_axes(offset_s, monkeypat
     body = Rotation.from_rotvec(rate * 0.25).as_matrix()  # b0_R_b1
     c1_R_c0 = BODY_R_CAM.T @ body.T @ BODY_R_CAM
     camera = replace(CAMERA, time_offset_s=offset_s)
-    told = []
+    reported = []
     real = tracking.follow
-    monkeypatch.setattr(tracking, "follow", lambda *arguments: told.append(arguments[-1]) or real(*arguments))
+    monkeypatch.setattr(tracking, "follow", lambda *arguments: reported.append(arguments[-1]) or real(*arguments))
     tracker = Tracker(camera, BODY_R_CAM, Gyro.of(imu), 120, itertools.count(7))
     ids, px = tracker.step(seen(PLANE, FIRST), 0)
     assert ids.tolist() == list(range(7, 7 + len(ids))) and len(ids) > 60
     ids_1, px_1 = tracker.step(seen(PLANE, turning(c1_R_c0) @ FIRST), 250_000_000)
-    np.testing.assert_allclose(told, [c1_R_c0], atol=1e-12)
+    np.testing.assert_allclose(reported, [c1_R_c0], atol=1e-12)
     both, at, at_1 = np.intersect1d(ids, ids_1, return_indices=True)
     miss = np.linalg.norm(moved(turning(c1_R_c0), px[at]) - px_1[at_1], axis=1)
     assert len(both) > 40 and np.median(miss) < 0.2

@@ -26,8 +26,8 @@ GYRO = 0.002  # rad
 
 
 def run(pair, *, prior=None, method="magsac", seed=0, sigma=SIGMA):
-    told = None if prior is None else RotationPrior(prior, GYRO)
-    return two_view(pair.xy0, pair.xy1, sigma, method=method, prior=told, seed=seed)
+    reported = None if prior is None else RotationPrior(prior, GYRO)
+    return two_view(pair.xy0, pair.xy1, sigma, method=method, prior=reported, seed=seed)
 
 
 def error(found_R, found_t, R, t):
@@ -74,12 +74,12 @@ def test_covariance_holds_with_wrong_matches_too(wrong):
     assert np.mean(ratios) < 1.7 and max(ratios) < 5.0  # mean of 60 squares: 1 +- 0.18
 
 
-def mean_nees(motion, matches, told, seeds):
-    """Of fits to right matches, with a sigma told."""
+def mean_nees(motion, matches, reported, seeds):
+    """Of fits to right matches, with a sigma reported."""
     out = []
     for seed in seeds:
         pair = view(seed, matches, t=motion)
-        matched = MatchedPoints(pair.xy0, pair.xy1, np.full(matches, told))
+        matched = MatchedPoints(pair.xy0, pair.xy1, np.full(matches, reported))
         fit = refine(EpipolarModel(matched), (pair.R, pair.t), loss_scale=None)
         off = error(*fit.state, pair.R, pair.t)
         out.append(off @ np.linalg.solve(covariance("general", matched, fit, None), off) / 5.0)
@@ -91,12 +91,12 @@ def mean_nees(motion, matches, told, seeds):
     [(SIDEWAYS, 15), (SIDEWAYS, 300), (FORWARD, 30), (FORWARD, 100), (SHORT, 300)],
     ids=["sideways-15", "sideways-300", "forward-30", "forward-100", "short-300"],
 )
-def test_covariance_is_honest(motion, matches):
+def test_covariance_is_consistent(motion, matches):
     assert 0.85 < mean_nees(motion, matches, SIGMA, range(300)) < 1.15  # 300 x 5 squares: 1 +- 0.037
     assert mean_nees(motion, matches, SIGMA / 2.0, range(60)) > 2.5
 
 
-def test_the_covariance_told_is_honest():
+def test_the_reported_covariance_is_consistent():
     pairs = [view(seed, 100) for seed in range(150)]
     found = [run(pair) for pair in pairs]
     assert 0.82 < np.mean([nees(one, pair) for one, pair in zip(found, pairs, strict=True)]) < 1.18  # 1 +- 0.05
@@ -127,7 +127,7 @@ def test_a_turn_on_the_spot_has_no_baseline(wrong, prior):
     assert np.mean(ratios) < 2.5  # 18 squares
 
 
-def test_rotation_of_a_turn_on_the_spot_is_honest():
+def test_rotation_of_a_turn_on_the_spot_is_consistent():
     pairs = [view(seed, 60, t=NOWHERE) for seed in range(100)]
     found = [(run(pair), pair) for pair in pairs]
     assert sum(one.kind == "rotation" for one, _ in found) >= 97
@@ -144,14 +144,16 @@ def test_a_plane_is_seen_as_one_and_the_gyro_tells_its_two_poses_apart(wrong):
     assert np.mean([nees(one, pair) for one, pair in zip(found, pairs, strict=True)]) < 1.8
 
 
-def test_the_two_poses_of_a_plane_are_told_where_nothing_tells_them_apart():
+def test_the_two_poses_of_a_plane_are_reported_where_nothing_separates_them():
     pairs = [view(seed, plane=True) for seed in range(20)]
     # the other plane is what the cameras see where the true one is turned by more
     pairs += [view(seed, plane=True, w=(0.3, -0.2, 0.1)) for seed in range(20)]
     found = [run(pair) for pair in pairs]
     assert all(one.kind == "planar" for one in found)
-    told = [one.reason == "another pose explains the plane as well; the smaller rotation was taken" for one in found]
-    assert np.mean(told) > 0.9
+    reported = [
+        one.reason == "another pose explains the plane as well; the smaller rotation was taken" for one in found
+    ]
+    assert np.mean(reported) > 0.9
     wrong = [angle_deg(one.c0_t_c1, pair.t) > 20.0 for one, pair in zip(found, pairs, strict=True)]
     assert not any(wrong[:20]) and all(wrong[20:])
     sigma = [np.degrees(np.sqrt(np.linalg.eigvalsh(one.covariance[3:, 3:])[-1])) for one in found]
@@ -179,9 +181,9 @@ def test_few_matches_of_a_short_baseline_claim_little(baseline, matches):
     assert np.mean(np.array(ratios) > 10.0) < 0.08
 
 
-def test_a_baseline_that_may_point_either_way_is_told():
-    told = [run(view(seed, 30, t=(0.05, 0.0, 0.0))) for seed in range(20)]
-    doubted = [one for one in told if one.kind == "general" and one.reason]
+def test_a_baseline_that_may_point_either_way_is_reported():
+    reported = [run(view(seed, 30, t=(0.05, 0.0, 0.0))) for seed in range(20)]
+    doubted = [one for one in reported if one.kind == "general" and one.reason]
     assert len(doubted) >= 4 and {one.reason for one in doubted} == {"another pose explains the matches about as well"}
     assert min(np.linalg.eigvalsh(one.covariance[3:, 3:])[-1] for one in doubted) > 0.05  # rad^2
 
@@ -235,8 +237,8 @@ def test_noise_by_match_weighs_the_matches():
     off = {"each": [], "one": []}
     for seed in range(20):
         pair = view(seed, sigma=sigma[:, None])
-        for name, told in (("each", sigma), ("one", np.full(300, np.sqrt(np.mean(sigma**2))))):
-            found = two_view(pair.xy0, pair.xy1, told)
+        for name, reported in (("each", sigma), ("one", np.full(300, np.sqrt(np.mean(sigma**2))))):
+            found = two_view(pair.xy0, pair.xy1, reported)
             off[name].append(turn_deg(found.c0_R_c1, pair.R))
     assert np.median(off["each"]) < 0.8 * np.median(off["one"])
 

@@ -1,4 +1,4 @@
-"""Two-view geometry on real pictures with known poses; figures as scripts/reproduce_two_view tells them."""
+"""Two-view geometry on real pictures with known poses; figures as scripts/reproduce_two_view gives them."""
 
 import itertools
 

@@ -37,5 +37,5 @@ def view(seed, matches=300, wrong=0.0, *, t=SIDEWAYS, w=TURN, plane=False, sigma
 
 
 def turned(R, seed, sigma):
-    """A rotation as a gyro tells it: off by `sigma` rad an axis."""
+    """A rotation as a gyro gives it: off by `sigma` rad an axis."""
     return R @ Rotation.from_rotvec(np.random.default_rng(seed + 10_000).normal(0.0, sigma, 3)).as_matrix()

@@ -24,14 +24,14 @@ def test_every_factor_in_use_is_there(run, influence):
     counts = {}
     for group in influence.groups:
         counts[group.sensor] = counts.get(group.sensor, 0) + len(group.t_ns)
-    told = run.summary["factors"]
-    assert {name: counts[name] for name in told} == told
+    reported = run.summary["factors"]
+    assert {name: counts[name] for name in reported} == reported
     free = sum(not state.held for state in run.estimate.session.values())
     assert counts.get("calibration", 0) == free
 
 
 def test_rows_are_the_whitened_residuals_of_the_factors(run, influence):
-    """Half their squares is GTSAM's own error, sensor by sensor; only a loss tells the two apart."""
+    """Half their squares is GTSAM's own error, sensor by sensor; only a loss separates the two."""
     for sensor in ("imu", "imu_bias", "prior"):
         half = 0.5 * sum(float((g.augmented[:, :, -1] ** 2).sum()) for g in influence.groups if g.sensor == sensor)
         errors = [factor.error(run.estimate.values) for tag, factor in run.estimate.factors if tag.sensor == sensor]
@@ -67,9 +67,9 @@ def test_a_round_trip_is_exact(influence, tmp_path):
     assert back.keyframes.kind.tolist() == influence.keyframes.kind.tolist()
 
 
-def test_tags_are_told_by_their_builder():
-    told = [
+def test_tags_are_reported_by_their_builder():
+    reported = [
         builder_of(tag)
         for tag in ("imu_bias", "gnss_velocity", "gnss_correlated_error", "static_turn", "rest", "prior")
     ]
-    assert told == ["imu", "gnss_velocity", "gnss", "static", "prior", "prior"]
+    assert reported == ["imu", "gnss_velocity", "gnss", "static", "prior", "prior"]
