@@ -172,6 +172,8 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     """Standstills and stances by inertial data, listed spans and images."""
     vehicle = notes.config.run.vehicle or session.device.vehicle
     noise, options = notes.calibration.imu_noise, notes.config.standstill
+    if options.mounting == "auto":
+        options = replace(options, mounting=session.device.mounting)
     seen = None if notes.pairs is None else static_periods(notes.pairs)
     imu, gravity = session.require_imu(), session.gravity
     available_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None

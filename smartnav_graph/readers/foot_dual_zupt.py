@@ -56,7 +56,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     else:
         found = f"names the foot {foot!r}" if foot else "holds two feet"
         raise SessionError(source, found, "one foot", f"give {path}#left or {path}#right")
-    device = Device(name=f"foot-mounted IMU, {foot}", forward="+x", up="+z", vehicle="foot")
+    device = Device(name=f"foot-mounted IMU, {foot}", forward="+x", up="+z", vehicle="foot", mounting="foot")
     return build_session(tables, repairs, device=device, clock_epoch="unknown")
 
 

@@ -42,7 +42,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         tables["reference"] = (path, {"t_ns": t_ns} | vector_columns("{}_m", position, "enu"))
     else:
         tables["control"] = (path, _points(path, variables, t_ns))
-    device = Device(name="foot-mounted MicroStrain 3DM-GX5-25", forward="+x", up="-z", vehicle="foot")
+    device = Device(name="foot-mounted MicroStrain 3DM-GX5-25", forward="+x", up="-z", vehicle="foot", mounting="foot")
     return build_session(tables, repairs, device=device, clock_epoch="unknown")
 
 

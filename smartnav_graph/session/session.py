@@ -24,21 +24,27 @@ from smartnav_graph.session.streams import Imu, Streams
 GPS_EPOCH_S = 315_964_800
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
+MOUNTINGS = ("auto", "foot", "body")
 
 
 @dataclass(frozen=True)
 class Device:
-    """Which body axis points forward and up, and what carries the device."""
+    """Which body axis points forward and up, what carries the device, and whether it is mounted on a foot.
+
+    mounting : ``foot``, ``body`` (anywhere else), or ``auto`` where the data have to show it
+    """
 
     name: str = "unknown"
     forward: str = "+y"
     up: str = "+z"
     vehicle: str = "none"
+    mounting: str = "auto"
 
     def __post_init__(self) -> None:
         frames.body_R_vehicle(self.forward, self.up)
-        if self.vehicle not in VEHICLES:
-            raise SessionError("session.toml [device]", f"vehicle = {self.vehicle!r}", f"one of {', '.join(VEHICLES)}")
+        for name, value, known in (("vehicle", self.vehicle, VEHICLES), ("mounting", self.mounting, MOUNTINGS)):
+            if value not in known:
+                raise SessionError("session.toml [device]", f"{name} = {value!r}", f"one of {', '.join(known)}")
 
 
 @dataclass(frozen=True)

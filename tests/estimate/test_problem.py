@@ -13,6 +13,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config, RunConfig
 from smartnav_graph.estimate.preparation import PREPARE, Notes
 from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.session.detect.standstills import StandstillConfig
 from smartnav_graph.session.streams import Temperature
 from smartnav_graph.simulation.degrade import Degrade, degrade
 
@@ -146,3 +147,13 @@ def test_each_step_of_the_preparation_stands_alone(eight):
     notes.drop("older", {"gnss": 2})
     notes.drop("later", {"gnss": 1})
     assert notes.dropped == {"gnss": {"older": 2, "later": 1}}
+
+
+def test_the_mounting_that_a_session_declares_is_used(eight):
+    declared = eight.replace(device=replace(eight.device, vehicle="foot", mounting="foot"))
+    assert prepare(declared, Config()).rests.on_foot
+    options = Config(standstill=StandstillConfig(mounting="body"))
+    assert not prepare(declared, options).rests.on_foot  # what the user says comes first
+    assert not prepare(eight, Config()).rests.on_foot
+    with pytest.raises(SessionError, match=r"mounting = 'shoe'; expected one of auto, foot, body"):
+        replace(eight.device, mounting="shoe")

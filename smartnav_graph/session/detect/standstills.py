@@ -21,11 +21,11 @@ from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.session.calibration.model import ImuNoise
 from smartnav_graph.session.detect.blocks import BLOCK_S, Blocks
 from smartnav_graph.session.detect.stances import DETECTORS, REST_SPEED, is_foot_mounted, stance_speed
+from smartnav_graph.session.session import MOUNTINGS
 from smartnav_graph.session.streams import Imu, StaticPeriod
 
 # Nothing that is found at t depends on data later than t + this.
 LOOKAHEAD_S = 1.0
-MOUNTINGS = ("auto", "foot", "body")
 
 # Blocks in a window, blocks at its ends that are left out where it borders on motion, limits of the scatter of block
 # means (rad/s, m/s^2): wheels on the smoothest road turn a device by more, and a hand or a walking foot by far.
@@ -50,7 +50,8 @@ class StandstillConfig:
     use_listed : use the periods of static.parquet; detect : find standstills in the inertial data
     standing : a pedestrian at rest with the device in the hand has zero velocity, within that of the hand; never on
     wheels
-    detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (by the data)
+    detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (as the
+    session declares it, else by the data)
     zupt, zaru : zero velocity, zero angular rate; flat_floor : all stances are on one level, to floor_sigma m
     """
 

@@ -9,6 +9,8 @@ from smartnav_graph import readers
 from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
+from smartnav_graph.estimate.config import Config, RunConfig
+from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.session.detect.stances import REST_SPEED, stance_speed
 from smartnav_graph.session.detect.standstills import (
@@ -192,13 +194,15 @@ def test_a_walking_foot_is_recognised(dataset, walk):
     assert on_foot(file)
 
 
-@pytest.mark.xfail(strict=True, reason="the share of stances is too small: a runner and a very slow walk")
 @pytest.mark.parametrize("walk", ["2017-11-22-11-27-30", "2017-11-27-11-25-12"])
-def test_a_running_or_creeping_foot_is_recognised(dataset, walk):
+def test_the_reader_declares_the_foot_of_a_runner_and_of_a_slow_walker(dataset, walk):
+    """Their stances are too rare to show the mounting."""
     file = dataset("foot_pyshoe_vicon") / f"{walk}_LLIO.mat"
     if not file.exists():
         pytest.skip(f"{file.name} is not there")
-    assert on_foot(file)
+    assert not on_foot(file)
+    rests = prepare(readers.read(file), Config(run=RunConfig(initial="0,0,0,0"))).rests
+    assert rests is not None and rests.on_foot
 
 
 def test_real_feet_and_hands_are_distinguished(dataset):
