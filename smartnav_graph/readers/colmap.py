@@ -25,8 +25,6 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Device, Session
 
-NAME = "colmap"
-
 # Camera model -> (indices of fx, fy, cx, cy among the parameters, indices of the distortion, our model).
 _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int, ...], str]] = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "brown"),
@@ -142,7 +140,7 @@ def _images(path: Path) -> Iterator[tuple[list[float], str, str]]:
 
 
 READER = Reader(
-    name=NAME,
+    name="colmap",
     summary="COLMAP text model: pictures, cameras, poses of arbitrary scale; no IMU, no times",
     recognised_by="one cameras.txt beside images.txt, in the folder or up to two levels below",
     matches=lambda source: _model(source) is not None,

@@ -16,10 +16,9 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import ns_from_texts
-from smartnav_graph.readers.source import Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.session.session import Device, Session
 
-NAME = "comma2k19"
 IMU = Path("processed_log", "IMU")
 FIXES = Path("processed_log", "GNSS", "live_gnss_ublox")
 SPEED = Path("processed_log", "CAN", "speed")
@@ -52,7 +51,7 @@ def _imu_columns(root: Path) -> Table:
     t_ns = _times(root / IMU / "accelerometer" / "t", len(accel))
     if not np.array_equal(t_ns, _times(root / IMU / "gyro" / "t", len(gyro))):
         raise SessionError(root / IMU, "accelerometer and gyro have different stamps", "one stamp for both")
-    return {"t_ns": t_ns} | vector_columns("gyro_{}_rad_s", gyro) | vector_columns("accel_{}_m_s2", accel)
+    return inertial_columns(t_ns, gyro, accel)
 
 
 def _fix_columns(root: Path) -> Table:
@@ -71,7 +70,7 @@ def _reference_columns(folder: Path, frame: LocalFrame) -> Table:
     quat = quaternion(frame.nav_R_ecef @ ecef_R_body)
     columns: Table = {"t_ns": _times(folder / "frame_times", len(ecef))}
     columns |= vector_columns("{}_m", frame.nav_from_ecef(ecef), "enu")
-    columns |= dict(zip(("qw", "qx", "qy", "qz"), quat.T, strict=True))
+    columns |= vector_columns("q{}", quat, "wxyz")
     return columns | vector_columns("v{}_m_s", velocity @ frame.nav_R_ecef.T, "enu")
 
 
@@ -105,7 +104,7 @@ def _times(path: Path, count: int) -> Times:
 
 
 READER = Reader(
-    name=NAME,
+    name="comma2k19",
     summary="comma2k19 segment: IMU 104 Hz, u-blox fixes, wheel speed, global pose",
     recognised_by="a folder with processed_log/IMU/accelerometer/t",
     matches=_matches,

@@ -17,8 +17,6 @@ from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
 
-NAME = "csv"
-
 _log = logging.getLogger(__name__)
 
 
@@ -72,7 +70,7 @@ def _column(table: TextTable, name: str, kind: str | None) -> Column:
 
 
 READER = Reader(
-    name=NAME,
+    name="csv",
     summary="folder of CSV files with the session's own columns",
     recognised_by="a folder with imu.csv, gnss.csv or another stream's name, and optionally session.toml",
     matches=lambda source: bool(_files(Path(source))),

@@ -16,13 +16,12 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.readers.reference import euroc_columns
-from smartnav_graph.readers.source import Reader, build_session, mount, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, mount
 from smartnav_graph.readers.text import read_bytes, read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Device, Mount, Session
 
-NAME = "euroc"
 GRAVITY = 9.81
 # The cameras are triggered by the clock of the IMU, and were calibrated with it to hundredths of a degree (Furgale et
 # al. 2013, Kalibr): images of a flight determine their attitude less well.
@@ -48,7 +47,9 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if root is None:
         raise SessionError(source, "holds no imu0/data.csv", "an ASL folder (mav0)", "give the folder that holds imu0")
     imu = root / "imu0" / "data.csv"
-    tables = {"imu": (imu, _imu_columns(imu))}
+    rows = read_text(imu, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
+    samples = inertial_columns(rows.ints("t"), rows.floats("gx", "gy", "gz"), rows.floats("ax", "ay", "az"))
+    tables = {"imu": (imu, samples)}
     cameras = sorted(file.parent.name for file in root.glob("cam*/data.csv"))
     if cameras:
         tables["images"] = (root / cameras[0] / "data.csv", _image_columns(root, cameras))
@@ -64,12 +65,6 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         calibration=_calibration(root, cameras),
         pictures=root,
     )
-
-
-def _imu_columns(path: Path) -> Table:
-    table = read_text(path, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
-    gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
-    return {"t_ns": table.ints("t")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
 
 
 def _image_columns(root: Path, cameras: list[str]) -> Table:
@@ -144,7 +139,7 @@ def _extrinsics(path: Path) -> Floats:
 
 
 READER = Reader(
-    name=NAME,
+    name="euroc",
     summary="EuRoC / ASL folder: IMU, cameras, ground truth",
     recognised_by="a folder (or its mav0) with imu0/data.csv",
     matches=lambda source: _root(source) is not None,

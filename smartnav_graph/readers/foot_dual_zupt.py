@@ -16,11 +16,10 @@ from smartnav_graph.core.arrays import Column, Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.matlab import matrix, read_mat
-from smartnav_graph.readers.source import Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.readers.text import first_lines, read_text
 from smartnav_graph.session.session import Device, Session
 
-NAME = "foot-dual-zupt"
 RATE_HZ = 60
 NAV_FROM_FILE = np.array([1.0, -1.0, -1.0])
 FEET = ("left", "right")
@@ -32,23 +31,18 @@ HEADING = "time_index,acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z"
 WALKS = {"imuMeasLeft.csv": "left", "imuMeasRight.csv": "right"}
 
 
-def _split(source: str) -> tuple[Path, str]:
-    """Folder or file, and the foot named behind #."""
-    path, _, foot = source.partition("#")
-    return Path(path), foot
-
-
 def _matches(source: str) -> bool:
     if "\0" in source:
         return False
-    path, _ = _split(source)
+    path = Path(source.partition("#")[0])
     if path.name in WALKS:
         return any(line.startswith(HEADING) for line in first_lines(path, 1))
     return (path / MATLAB / "ImuFootLeft.mat").is_file()
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
-    path, foot = _split(source)
+    name, _, foot = source.partition("#")
+    path = Path(name)
     if path.name in WALKS:
         foot, tables = WALKS[path.name], _walk(path)
     elif foot in FEET:
@@ -67,7 +61,8 @@ def _whole(folder: Path, foot: str) -> dict[str, tuple[Path, Table]]:
     rows = matrix(inertial, read_mat(inertial), "ImuFootLeft", first + 6)[:, first:]
     position = matrix(folder / name, read_mat(folder / name), variable, 3, len(rows))
     index = np.arange(len(rows))
-    return {"imu": (inertial, _imu(index, rows)), "reference": (folder / name, _reference(index, position))}
+    samples = inertial_columns(_times(index), rows[:, 3:], rows[:, :3])
+    return {"imu": (inertial, samples), "reference": (folder / name, _reference(index, position))}
 
 
 def _walk(path: Path) -> dict[str, tuple[Path, Table]]:
@@ -75,7 +70,7 @@ def _walk(path: Path) -> dict[str, tuple[Path, Table]]:
     table = read_text(path)
     table.require(HEADING.split(","))
     rows = table.floats(*HEADING.split(",")[1:])
-    tables = {"imu": (path, _imu(table.floats("time_index"), rows))}
+    tables = {"imu": (path, inertial_columns(_times(table.floats("time_index")), rows[:, 3:], rows[:, :3]))}
     truth = path.with_name("positionGt.csv")
     if truth.is_file():
         positions = read_text(truth)
@@ -91,17 +86,12 @@ def _times(index: Column) -> Times:
     return np.rint(np.asarray(index, dtype=np.float64) * (NS / RATE_HZ)).astype(np.int64)
 
 
-def _imu(index: Column, rows: Floats) -> Table:
-    t_ns = {"t_ns": _times(index)}
-    return t_ns | vector_columns("gyro_{}_rad_s", rows[:, 3:]) | vector_columns("accel_{}_m_s2", rows[:, :3])
-
-
 def _reference(index: Column, position: Floats) -> Table:
     return {"t_ns": _times(index)} | vector_columns("{}_m", position * NAV_FROM_FILE, "enu")
 
 
 READER = Reader(
-    name=NAME,
+    name="foot-dual-zupt",
     summary="two foot-mounted IMUs, 60 Hz, foot positions; FOLDER#left, FOLDER#right",
     recognised_by="a folder with dataPreparation/ImuFootLeft.mat, or imuMeasLeft.csv, imuMeasRight.csv",
     matches=_matches,

@@ -16,11 +16,11 @@ from smartnav_graph.core.arrays import Table
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import from_quaternion
 from smartnav_graph.readers.euroc import calibrated
-from smartnav_graph.readers.source import Reader, build_session, example_file, mount, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, example_file, inertial_columns, mount
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
-from smartnav_graph.session.session import Device, Mount, Session
+from smartnav_graph.session.session import Device, Session
 
 NAME = "gtsam-euroc"
 FILE = "eqvio_processed_30s.csv"
@@ -32,39 +32,43 @@ GRAVITY = 9.81
 _HEADING = "row_type,t_abs,t_rel,seq,frame_idx,landmark_id,"
 
 
-def _path(source: str) -> Path:
-    return example_file(FILE) if source == NAME else Path(source)
-
-
 def _matches(source: str) -> bool:
     return source == NAME or "".join(first_lines(Path(source), 1)).startswith(_HEADING)
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
-    path = _path(source)
+    path = example_file(FILE) if source == NAME else Path(source)
     table = read_text(path)
     table.require(("row_type", "t_abs", "frame_idx", "landmark_id", "u_norm", "v_norm", "key", "value"))
     features = table.where("row_type", "vision_feature")
+    tracks: Table = {
+        "t_ns": features.times("t_abs"),
+        "image_id": features.ints("frame_idx"),
+        "track_id": features.ints("landmark_id"),
+        "x_n": features.floats("u_norm"),
+        "y_n": features.floats("v_norm"),
+    }
     tables = {
         "imu": (path, _imu_columns(table.where("row_type", "imu"))),
         "images": (path, _image_columns(features)),
-        "tracks": (path, _track_columns(features)),
+        "tracks": (path, tracks),
     }
+    camera = _camera(table)
+    pose = np.array(_meta(table, [f"T_ci_{name}" for name in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]))
     return build_session(
         tables,
         repairs,
-        calibration=Calibration(device=DEVICE, cameras={CAMERA: _camera(table)}),
+        calibration=Calibration(device=DEVICE, cameras={CAMERA: camera}),
         device=Device(name=DEVICE, forward="+z", up="+x"),
         clock_epoch="unix",
         gravity_m_s2=GRAVITY,
-        sensors={CAMERA: _mount(table)},
+        sensors={CAMERA: mount(pose[:3], from_quaternion(pose[None, 3:])[0])},
     )
 
 
 def _imu_columns(table: TextTable) -> Table:
     table.require(("gx", "gy", "gz", "ax", "ay", "az"))
-    gyro = vector_columns("gyro_{}_rad_s", table.floats("gx", "gy", "gz"))
-    return {"t_ns": table.times("t_abs")} | gyro | vector_columns("accel_{}_m_s2", table.floats("ax", "ay", "az"))
+    return inertial_columns(table.times("t_abs"), table.floats("gx", "gy", "gz"), table.floats("ax", "ay", "az"))
 
 
 def _image_columns(features: TextTable) -> Table:
@@ -78,16 +82,6 @@ def _image_columns(features: TextTable) -> Table:
     }
 
 
-def _track_columns(features: TextTable) -> Table:
-    return {
-        "t_ns": features.times("t_abs"),
-        "image_id": features.ints("frame_idx"),
-        "track_id": features.ints("landmark_id"),
-        "x_n": features.floats("u_norm"),
-        "y_n": features.floats("v_norm"),
-    }
-
-
 def _meta(table: TextTable, names: Sequence[str]) -> list[float]:
     """Numbers of the meta rows."""
     rows = table.where("row_type", "meta")
@@ -96,11 +90,6 @@ def _meta(table: TextTable, names: Sequence[str]) -> list[float]:
         return [float(values[name]) for name in names]
     except (KeyError, ValueError) as error:
         raise SessionError(rows.path, f"camera: {error}", f"meta rows {', '.join(names)}") from error
-
-
-def _mount(table: TextTable) -> Mount:
-    pose = np.array(_meta(table, [f"T_ci_{name}" for name in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]))
-    return mount(pose[:3], from_quaternion(pose[None, 3:])[0])
 
 
 def _camera(table: TextTable) -> Camera:

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from smartnav_graph.core.arrays import Table
-from smartnav_graph.readers.source import Reader, build_session, example_file, vector_columns
-from smartnav_graph.readers.text import TextTable, first_lines, read_text
+from smartnav_graph.readers.source import Reader, build_session, example_file, inertial_columns, vector_columns
+from smartnav_graph.readers.text import first_lines, read_text
 from smartnav_graph.session.session import Device, Session
 
 NAME = "gtsam-kitti"
@@ -20,10 +19,6 @@ GRAVITY = 9.81
 
 _ACCEL = ("accelX", "accelY", "accelZ")
 _GYRO = ("omegaX", "omegaY", "omegaZ")
-
-
-def _folder(source: str) -> Path:
-    return example_file(IMU_FILE).parent if source == NAME else Path(source)
 
 
 def _matches(source: str) -> bool:
@@ -36,24 +31,15 @@ def _matches(source: str) -> bool:
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
-    folder = _folder(source)
-    tables = {
-        "imu": (folder / IMU_FILE, _imu_columns(read_text(folder / IMU_FILE))),
-        "gnss": (folder / GNSS_FILE, _fix_columns(read_text(folder / GNSS_FILE))),
-    }
+    folder = example_file(IMU_FILE).parent if source == NAME else Path(source)
+    inertial, fixes = read_text(folder / IMU_FILE), read_text(folder / GNSS_FILE)
+    inertial.require(("Time", *_GYRO, *_ACCEL))
+    fixes.require(("Time", "X", "Y", "Z"))
+    imu = inertial_columns(inertial.times("Time"), inertial.floats(*_GYRO), inertial.floats(*_ACCEL))
+    gnss = {"t_ns": fixes.times("Time")} | vector_columns("{}_m", fixes.floats("X", "Y", "Z"), "enu")
+    tables = {"imu": (folder / IMU_FILE, imu), "gnss": (folder / GNSS_FILE, gnss)}
     device = Device(name="KITTI OXTS RT3003", forward="+x", up="+z")
     return build_session(tables, repairs, device=device, gravity_m_s2=GRAVITY)
-
-
-def _imu_columns(table: TextTable) -> Table:
-    table.require(("Time", *_GYRO, *_ACCEL))
-    gyro = vector_columns("gyro_{}_rad_s", table.floats(*_GYRO))
-    return {"t_ns": table.times("Time")} | gyro | vector_columns("accel_{}_m_s2", table.floats(*_ACCEL))
-
-
-def _fix_columns(table: TextTable) -> Table:
-    table.require(("Time", "X", "Y", "Z"))
-    return {"t_ns": table.times("Time")} | vector_columns("{}_m", table.floats("X", "Y", "Z"), "enu")
 
 
 READER = Reader(

@@ -24,13 +24,12 @@ import pyarrow as pa
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.readers.source import Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_bytes
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, ImuNoise
 from smartnav_graph.session.session import Device, Session
 from smartnav_graph.session.streams import Imu
 
-NAME = "indoor-waypoints"
 MS = NS // 1000
 LABEL_SIGMA = 0.7  # m per axis: labels lie 0.5 to 1 m beside the line that was walked
 HEIGHT_SIGMA = 0.2  # m
@@ -117,8 +116,7 @@ def _imu(path: Path, tables: dict[str, TextTable]) -> Table:
         raise SessionError(
             path, "accelerometer and gyroscope have different stamps", "one stamp for both, as in this format"
         )
-    columns = vector_columns("accel_{}_m_s2", _vectors(accel))
-    return {"t_ns": t_ns} | columns | vector_columns("gyro_{}_rad_s", _vectors(gyro))
+    return inertial_columns(t_ns, _vectors(gyro), _vectors(accel))
 
 
 def polled_noise(imu: Imu) -> ImuNoise:
@@ -159,7 +157,7 @@ def _phone(path: Path) -> str:
 
 
 READER = Reader(
-    name=NAME,
+    name="indoor-waypoints",
     summary="Indoor Location Competition trace: phone IMU, waypoints on a floor plan",
     recognised_by="a text file that begins with # startTime:",
     matches=_matches,

@@ -21,7 +21,6 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Device, Session
 
-NAME = "kitti-odometry"
 PICTURES = ("image_0", "image_l")
 CAMERA = "left"
 PERIOD_NS = NS // 10
@@ -50,7 +49,9 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if not files:
         raise SessionError(folder, "holds no pictures", "files *.png", "give the whole sequence")
     t_ns = _times(root / "times.txt", len(files))
-    tables = {"images": (folder, _images(files, t_ns))}
+    names = np.array(files, dtype=object)
+    images = {"t_ns": t_ns, "image_id": np.arange(len(files)), "file": names, "camera": np.full_like(names, CAMERA)}
+    tables = {"images": (folder, images)}
     if (root / "poses.txt").is_file():
         tables["reference"] = (root / "poses.txt", {"t_ns": t_ns} | _poses(root / "poses.txt", len(files)))
     camera = _camera(root / "calib.txt", folder / files[0])
@@ -62,11 +63,6 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         calibration=Calibration(device="KITTI left camera", cameras={CAMERA: camera}),
         pictures=folder,
     )
-
-
-def _images(files: list[str], t_ns: Times) -> Table:
-    names = np.array(files, dtype=object)
-    return {"t_ns": t_ns, "image_id": np.arange(len(files)), "file": names, "camera": np.full_like(names, CAMERA)}
 
 
 def _times(path: Path, count: int) -> Times:
@@ -111,7 +107,7 @@ def _size(picture: Path) -> tuple[int, int]:
 
 
 READER = Reader(
-    name=NAME,
+    name="kitti-odometry",
     summary="KITTI odometry sequence: left grey pictures, calibration, poses; no IMU",
     recognised_by="a folder with calib.txt and image_0 or image_l (or the only such folder in it)",
     matches=lambda source: _root(source) is not None,

@@ -16,10 +16,9 @@ from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.readers.matlab import matrix, names_in, read_mat
-from smartnav_graph.readers.source import Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.session.session import Device, Session
 
-NAME = "pyshoe"
 # Sigmas, metres: a foot's IMU is a shoe's width away from the marked point; heights of the floor were not measured.
 ON_THE_POINT = 0.1
 UNKNOWN_HEIGHT = 100.0
@@ -35,8 +34,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     rows = matrix(path, variables, "imu_data", 6)
     vicon = "gt" in variables
     t_ns = _times(path, variables, "timestamps_all" if vicon else "timestamps", len(rows))
-    imu = vector_columns("gyro_{}_rad_s", rows[:, 3:]) | vector_columns("accel_{}_m_s2", rows[:, :3])
-    tables: dict[str, tuple[Path, Table]] = {"imu": (path, {"t_ns": t_ns} | imu)}
+    tables = {"imu": (path, inertial_columns(t_ns, rows[:, 3:], rows[:, :3]))}
     if vicon:
         position = _level(matrix(path, variables, "gt", 2, len(rows)))
         tables["reference"] = (path, {"t_ns": t_ns} | vector_columns("{}_m", position, "enu"))
@@ -72,7 +70,7 @@ def _points(path: Path, variables: Table, t_ns: Times) -> Table:
 
 
 READER = Reader(
-    name=NAME,
+    name="pyshoe",
     summary="foot-mounted IMU 200 Hz, VICON positions or marked points (LLIO-aided PyShoe .mat)",
     recognised_by="a .mat file with imu_data, strideIndex and GCP",
     matches=_matches,

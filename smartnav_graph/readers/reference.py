@@ -67,7 +67,7 @@ def load_reference(
         columns = read_table(file)
     else:
         file, lines = path, first_lines(path)
-        if _is_kitti(lines):
+        if lines and _is_numbers(lines[0], 12):
             return _built(file, _kitti(file, times, body_T_ref))
         columns = _columns(file, lines)
     if times is not None:
@@ -80,16 +80,18 @@ def _columns(path: Path, lines: list[str]) -> Table:
     if _is_euroc(lines):
         return euroc_columns(path)
     if _is_tum(lines):
-        return _tum(path)
+        table = read_text(path, names=("t", *_POSITION, "qx", "qy", "qz", "qw"))
+        return _pose_columns(table, table.times("t"))
     table = read_text(path)
-    if not _time_name(table):
+    time = next((name.lower() for name in table.cells if name.lower() in _TIME_UNITS), None)
+    if time is None:
         raise SessionError(
             path,
             f"is no known reference format; it begins with {lines[0][:60]!r}" if lines else "is empty",
             "TUM, EuRoC or KITTI poses, or a CSV whose heading names t, x, y, z",
             f"name the time column {', '.join(_TIME_UNITS)}",
         )
-    return _named(table)
+    return _named(table, time)
 
 
 def _is_numbers(line: str, count: int) -> bool:
@@ -97,10 +99,6 @@ def _is_numbers(line: str, count: int) -> bool:
         return len([float(cell) for cell in line.split()]) == count
     except ValueError:
         return False
-
-
-def _is_kitti(lines: list[str]) -> bool:
-    return bool(lines) and _is_numbers(lines[0], 12)
 
 
 def _is_tum(lines: list[str]) -> bool:
@@ -112,11 +110,6 @@ def _is_tum(lines: list[str]) -> bool:
 def _is_euroc(lines: list[str]) -> bool:
     heading = lines[0].lower() if lines else ""
     return heading.startswith("#time") and heading.count(",") + 1 in (8, 11, 17)
-
-
-def _tum(path: Path) -> Table:
-    table = read_text(path, names=("t", *_POSITION, "qx", "qy", "qz", "qw"))
-    return _pose_columns(table, table.times("t"))
 
 
 def euroc_columns(path: Path) -> Table:
@@ -137,18 +130,12 @@ def _pose_columns(table: TextTable, t_ns: Times) -> Table:
     return {"t_ns": t_ns} | position | {name: table.floats(name) for name in QUATERNION}
 
 
-def _time_name(table: TextTable) -> str | None:
-    return next((name for name in table.cells if name.lower() in _TIME_UNITS), None)
-
-
-def _named(table: TextTable) -> Table:
-    time = _time_name(table)
-    assert time is not None  # the caller looked
+def _named(table: TextTable, time: str) -> Table:
     lower = TextTable(table.path, {name.lower(): cells for name, cells in table.cells.items()})
     wanted = ("e_m", "n_m", "u_m") if "e_m" in lower.cells else _POSITION
     lower.require(wanted)
     known = {name for spec in Reference.specs() for name in spec.metadata["columns"]} - {"t_ns", "e_m", "n_m", "u_m"}
-    columns = {"t_ns": _named_times(lower, time.lower())} | vector_columns("{}_m", lower.floats(*wanted), "enu")
+    columns = {"t_ns": _named_times(lower, time)} | vector_columns("{}_m", lower.floats(*wanted), "enu")
     return columns | {name: lower.floats(name) for name in lower.cells if name in known and not lower.is_empty(name)}
 
 
@@ -208,8 +195,8 @@ def pose_columns(path: Path, poses: Floats) -> Table:
 
 
 def _columns_of(poses: Floats) -> Table:
-    quat = quaternion(poses[:, :3, :3])
-    return vector_columns("{}_m", poses[:, :3, 3], "enu") | dict(zip(QUATERNION, quat.T, strict=True))
+    quat = vector_columns("q{}", quaternion(poses[:, :3, :3]), "wxyz")
+    return vector_columns("{}_m", poses[:, :3, 3], "enu") | quat
 
 
 def _stack(columns: Table, *names: str) -> Floats:

@@ -5,23 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from smartnav_graph.core.arrays import Floats, Table
+from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.session.folder import build_stream
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
-
-
-class ReadFunction(Protocol):
-    """Source and names of repairs -> session."""
-
-    def __call__(self, source: str, repairs: tuple[str, ...]) -> Session: ...
 
 
 @dataclass(frozen=True)
@@ -32,14 +26,14 @@ class Reader:
     summary : what it is, one line
     recognised_by : how a source of this format is recognised, one line
     matches : cheap check of names and first lines; never raises for a source of another format
-    read_source : the conversion itself
+    read_source : the conversion itself, of a source and the names of repairs
     """
 
     name: str
     summary: str
     recognised_by: str
     matches: Callable[[str], bool]
-    read_source: ReadFunction
+    read_source: Callable[[str, tuple[str, ...]], Session]
 
     def read(self, source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
         """The session of `source`.
@@ -60,6 +54,11 @@ class Reader:
 def vector_columns(template: str, rows: Floats, axes: str = "xyz") -> Table:
     """Columns of the rows (n, k) of a vector: ``{}`` in `template` becomes the axis."""
     return {template.format(axis): column for axis, column in zip(axes, rows.T, strict=True)}
+
+
+def inertial_columns(t_ns: Times, gyro: Floats, accel: Floats) -> Table:
+    """Columns of inertial samples: stamps (n,), angular rate (n, 3) rad/s, specific force (n, 3) m/s^2."""
+    return {"t_ns": t_ns} | vector_columns("gyro_{}_rad_s", gyro) | vector_columns("accel_{}_m_s2", accel)
 
 
 def mount(body_t: ArrayLike, body_R: ArrayLike) -> Mount:

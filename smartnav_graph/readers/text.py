@@ -17,7 +17,7 @@ import pyarrow.csv
 
 from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.timebase import NS, ns_from_text, ns_from_texts
+from smartnav_graph.core.timebase import NS, ns_from_text
 
 
 def read_bytes(path: Path) -> bytes:
@@ -91,12 +91,13 @@ class TextTable:
 
     def times(self, name: str, unit_ns: int = NS) -> Times:
         """One column of decimal clock readings in units of `unit_ns` as exact nanoseconds."""
-        texts = self.cells[name].to_pylist()
-        try:
-            return ns_from_texts(texts, unit_ns)
-        except SessionError as error:
-            row = next(i for i, text in enumerate(texts) if not _is_time(text, unit_ns))
-            raise self._bad_cell(name, row, "a decimal number") from error
+        found = np.empty(len(self), dtype=np.int64)
+        for row, text in enumerate(self.cells[name].to_pylist()):
+            try:
+                found[row] = ns_from_text(text, unit_ns)
+            except SessionError as error:
+                raise self._bad_cell(name, row, "a decimal number") from error
+        return found
 
     def is_empty(self, name: str) -> bool:
         """Whether no row of the column holds anything."""
@@ -124,14 +125,6 @@ def _casts(text: str | None, kind: pa.DataType) -> bool:
     return True
 
 
-def _is_time(text: str, unit_ns: int) -> bool:
-    try:
-        ns_from_text(text, unit_ns)
-    except SessionError:
-        return False
-    return True
-
-
 def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
     """Read comma, semicolon, tab or blank separated text.
 
@@ -149,7 +142,8 @@ def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
         Missing, unreadable, no text, no rows, rows of different length, or a column name twice.
     """
     heading, body = _split(path, with_heading=names is None)
-    separator = _separator(heading if names is None else body[:4096].split(b"\n", 1)[0])
+    first = heading if names is None else body[:4096].split(b"\n", 1)[0]
+    separator = next((mark for mark in ",;\t" if mark.encode() in first), " ")
     columns = list(names) if names is not None else _heading_names(heading, separator)
     if len(set(columns)) != len(columns):
         twice = sorted({name for name in columns if columns.count(name) > 1})
@@ -172,13 +166,6 @@ def _split(path: Path, *, with_heading: bool) -> tuple[bytes, bytes]:
     if b"#" in data:
         data = re.sub(rb"(?m)^[ \t]*#.*\n?", b"", data)
     return heading.strip(), data
-
-
-def _separator(line: bytes) -> str:
-    for separator in (b",", b";", b"\t"):
-        if separator in line:
-            return separator.decode()
-    return " "
 
 
 def _heading_names(heading: bytes, separator: str) -> list[str]:

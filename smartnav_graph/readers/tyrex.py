@@ -32,13 +32,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.so3 import quaternion
 from smartnav_graph.core.timebase import interpolate, nearest, ns_from_seconds, ns_from_text, seconds_since
 from smartnav_graph.readers.matlab import read_mat
-from smartnav_graph.readers.source import Reader, build_session, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.readers.text import first_lines, read_bytes, read_text
 from smartnav_graph.session.session import Device, Session
 
-NAME = "tyrex"
 GRAVITY = 9.8056  # m/s^2, normal gravity at the hall near Grenoble (45.22 deg north, 250 m)
 SAME_STAMP_NS = 10_000  # stamps closer than this count as one: readings change less in between than they are resolved
 
@@ -119,20 +119,16 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     return session.replace(dropped={name: {**session.dropped.get(name, {}), **dropped.get(name, {})} for name in names})
 
 
-def _required(folder: Path, name: str) -> Path:
-    file = _file(folder, name)
-    if file is None:
-        raise SessionError(folder / f"{name}.txt", "is missing", "a text file, or the same with .gz")
-    return file
-
-
 def _vectors(folder: Path, name: str, biased: bool) -> tuple[Times, Floats, Floats | None]:
     """Stamps (n,), readings (n, 3) less the system's first bias, and its biases (n, 3), None where none are written.
 
     The first for all rows: a bias that the system changes during the recording would be a step in the readings.
     """
     axes = ("x", "y", "z")
-    table = read_text(_required(folder, name), names=("t", *axes, *(_BIAS if biased else ())))
+    file = _file(folder, name)
+    if file is None:
+        raise SessionError(folder / f"{name}.txt", "is missing", "a text file, or the same with .gz")
+    table = read_text(file, names=("t", *axes, *(_BIAS if biased else ())))
     rows = table.floats(*axes)
     bias = table.floats(*_BIAS) if biased else None
     return table.times("t"), rows if bias is None else rows - bias[0], bias
@@ -153,18 +149,10 @@ def _imu(folder: Path, system: System) -> tuple[Table, dict[str, dict[str, int]]
         "of the accelerometer outside the gyro's span dropped": int(outside.sum()),
         "with the acceleration interpolated to the gyro's stamp": int(apart.sum()),
     }
-    columns = {"t_ns": t_ns} | vector_columns("gyro_{}_rad_s", gyro[both])
-    columns |= vector_columns("accel_{}_m_s2", system.accel_unit * interpolate(t_ns, at_ns, accel))
+    columns = inertial_columns(t_ns, gyro[both], system.accel_unit * interpolate(t_ns, at_ns, accel))
     columns |= {} if bias is None else vector_columns("system_bias_{}_rad_s", bias[both])
     changes = {reason: count for reason, count in counts.items() if count}
     return columns, {"imu": changes} if changes else {}
-
-
-def _start_ns(folder: Path, system: System) -> int:
-    """The phone's clock when the log began."""
-    if system is ANDROID:
-        return 0
-    return ns_from_text(_number(folder / IOS.mark, r"BootTime\s*=\s*(\S+)", "BootTime = seconds"))
 
 
 def _number(path: Path, pattern: str, expected: str) -> str:
@@ -184,12 +172,15 @@ def _truth(path: Path, folder: Path, system: System) -> tuple[Table, int]:
     """Columns of the optical frames on the phone's clock, and how many without markers were left out."""
     positions, rotations, rate = _rigid_body(path)
     aligned = _number(folder / "timeAlignment.txt", r"(\S+)", "t_truth - t_phone, seconds")
-    t_ns = _start_ns(folder, system) - ns_from_text(aligned) + ns_from_seconds(np.arange(positions.shape[1]) / rate)
+    begin = "0"  # of the log, on the phone's clock
+    if system is IOS:
+        begin = _number(folder / IOS.mark, r"BootTime\s*=\s*(\S+)", "BootTime = seconds")
+    t_ns = ns_from_text(begin) - ns_from_text(aligned) + ns_from_seconds(np.arange(positions.shape[1]) / rate)
     seen = np.isfinite(positions).all(axis=0) & np.isfinite(rotations).all(axis=0)
     # matrices are written column by column
-    nav_R_body = Rotation.from_matrix(rotations.T.reshape(-1, 3, 3).transpose(0, 2, 1)[seen])
+    nav_R_body = rotations.T.reshape(-1, 3, 3).transpose(0, 2, 1)[seen]
     columns = {"t_ns": t_ns[seen]} | vector_columns("{}_m", positions.T[seen] / 1000.0, "enu")
-    return columns | _quaternion_columns("q{}", nav_R_body), int((~seen).sum())
+    return columns | vector_columns("q{}", quaternion(nav_R_body), "wxyz"), int((~seen).sum())
 
 
 def _rigid_body(path: Path) -> tuple[Floats, Floats, float]:
@@ -209,10 +200,6 @@ def _rigid_body(path: Path) -> tuple[Floats, Floats, float]:
     return positions, rotations, rate
 
 
-def _quaternion_columns(template: str, rotations: Rotation) -> Table:
-    return vector_columns(template, rotations.as_quat(canonical=True)[:, [3, 0, 1, 2]], "wxyz")
-
-
 def _own_attitude(folder: Path, system: System, t_ns: Times) -> Table:
     """The system's own attitude at the frames, kept beside the truth for comparison; not a number outside its span."""
     file = _file(folder, system.attitude)
@@ -229,7 +216,7 @@ def _own_attitude(folder: Path, system: System, t_ns: Times) -> Table:
 
 
 READER = Reader(
-    name=NAME,
+    name="tyrex",
     summary="phone under motion capture (Tyrex): IMU, magnetometer, optical pose",
     recognised_by="a folder with accelerometer.txt, gyroscope.txt and record.properties or description.txt",
     matches=_matches,

@@ -6,9 +6,8 @@ inertial samples, flat ENU frame at 52 N, 11 E, 100 m, gravity constant and stra
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +71,36 @@ class Scenario:
     rest_sigma_m_s: float = 0.01
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
-        return _record(self, seed, calibrated)
+        motion, noise = _motion(self, seed), PROFILES[self.profile]
+        imu, biases = sensors.imu(
+            motion.truth, motion.t_ns, noise, frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m), motion.rng("imu")
+        )
+        streams: dict[str, Stream | None] = {
+            "gnss": _gnss(motion, self.gnss),
+            "control": _control(motion) if self.control else None,
+            "pose_fixes": _pose_fixes(motion, self.pose_fixes),
+            "ranges": _ranges(motion, self.ranges),
+            **_slow_sensors(motion, self),
+            **_camera(motion, self.camera),
+        }
+        rows = [np.arange(0, len(motion.t), SLOW_ROWS)]
+        rows += [np.searchsorted(motion.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
+        mounts = {} if self.gnss is None else {"gnss": Mount(body_t=self.gnss.body_t_antenna)}
+        if self.ranges is not None:
+            mounts["ranges"] = Mount(body_t=self.ranges.body_t_sensor)
+        if self.camera is not None:
+            mounts[self.camera.name] = self.camera.mount
+        return Session(
+            device=Device(name=f"simulated {self.profile}", vehicle=self.vehicle),
+            clock_epoch="unix",
+            origin=ORIGIN,
+            sensors=mounts,
+            calibration=_calibration(self) if calibrated else None,
+            imu=imu,
+            static=_static(motion, self.rest_sigma_m_s),
+            reference=reference(motion.truth, motion.t_ns, biases, np.unique(np.concatenate(rows))),
+            **streams,  # type: ignore[arg-type]
+        )
 
 
 # Every purpose has separate random numbers: a new sensor is added at the end and does not change the others.
@@ -96,6 +124,12 @@ class _Motion:
     def t_ns(self) -> Times:
         return START_NS + ns_from_seconds(self.t)
 
+    @property
+    def rests(self) -> list[tuple[float, float]]:
+        """Start and end (s) of the standstills, up to the last inertial sample."""
+        end = float(self.t[-1])
+        return [(start, min(stop, end)) for start, stop in self.trajectory.rests if start < end]
+
     def rng(self, purpose: str) -> np.random.Generator:
         return np.random.default_rng((self.seed, PURPOSES.index(purpose)))
 
@@ -108,39 +142,6 @@ def _motion(scenario: Scenario, seed: int) -> _Motion:
     trajectory = scenario.motion(scenario.seconds, np.random.default_rng((seed, 0)))
     t = np.arange(round(scenario.seconds * RATE_HZ)) / RATE_HZ
     return _Motion(trajectory, t, trajectory.sample(t), seed, LocalFrame(ORIGIN))
-
-
-def _record(scenario: Scenario, seed: int, calibrated: bool) -> Session:
-    motion = _motion(scenario, seed)
-    trajectory, t = motion.trajectory, motion.t
-    profile = PROFILES[scenario.profile]
-    imu, biases = sensors.imu(motion.truth, motion.t_ns, profile.noise, _gravity(), motion.rng("imu"))
-    streams: dict[str, Stream | None] = {
-        "gnss": _gnss(motion, scenario.gnss),
-        "control": _control(motion) if scenario.control else None,
-        "pose_fixes": _pose_fixes(motion, scenario.pose_fixes),
-        "ranges": _ranges(motion, scenario.ranges),
-        **_slow_sensors(motion, scenario),
-        **_camera(motion, scenario.camera),
-    }
-    rows = [np.arange(0, len(t), SLOW_ROWS)]
-    rows += [np.searchsorted(motion.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
-    mounts = {} if scenario.gnss is None else {"gnss": Mount(body_t=scenario.gnss.body_t_antenna)}
-    if scenario.ranges is not None:
-        mounts["ranges"] = Mount(body_t=scenario.ranges.body_t_sensor)
-    if scenario.camera is not None:
-        mounts[scenario.camera.name] = scenario.camera.mount
-    return Session(
-        device=Device(name=f"simulated {profile.name}", vehicle=scenario.vehicle),
-        clock_epoch="unix",
-        origin=ORIGIN,
-        sensors=mounts,
-        calibration=_calibration(scenario) if calibrated else None,
-        imu=imu,
-        static=_static(trajectory, motion.t_ns, scenario.rest_sigma_m_s),
-        reference=reference(motion.truth, motion.t_ns, biases, np.unique(np.concatenate(rows))),
-        **streams,  # type: ignore[arg-type]
-    )
 
 
 def _gnss(motion: _Motion, model: GnssModel | None) -> GnssFix | None:
@@ -156,7 +157,7 @@ def _gnss(motion: _Motion, model: GnssModel | None) -> GnssFix | None:
 
 
 def _control(motion: _Motion) -> ControlPoint:
-    at = _stop_rows(motion.trajectory, motion.t)
+    at = np.searchsorted(motion.t, [(start + end) / 2 for start, end in motion.rests])
     names = [f"P{i}" for i in range(len(at))]
     rng = motion.rng("control")
     return fixes.control(motion.truth.take(at), motion.t_ns[at], names, CONTROL_SIGMA_M, motion.frame, rng)
@@ -221,8 +222,7 @@ def shots(scenario: Scenario, seed: int) -> Iterator[render.Grey]:
 
 def scenario_constants(scenario: Scenario) -> dict[str, object]:
     """Every constant of a scenario by its dotted name, and the noise of its device: all but the seed."""
-    noise = dataclasses.asdict(PROFILES[scenario.profile].noise)
-    return _flat("", dataclasses.asdict(scenario) | {"noise": noise})
+    return _flat("", asdict(scenario) | {"noise": asdict(PROFILES[scenario.profile])})
 
 
 def _flat(name: str, value: object) -> dict[str, object]:
@@ -252,12 +252,8 @@ def _slow_sensors(motion: _Motion, scenario: Scenario) -> dict[str, Stream]:
     return made
 
 
-def _gravity() -> float:
-    return frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m)
-
-
 def _calibration(scenario: Scenario) -> Calibration:
-    profile, model = PROFILES[scenario.profile], scenario.gnss or GnssModel()
+    model = scenario.gnss or GnssModel()
     gnss = GnssNoise(
         horizontal_sigma=model.white_m,
         vertical_sigma=1.5 * model.white_m,
@@ -265,7 +261,8 @@ def _calibration(scenario: Scenario) -> Calibration:
         correlated_vertical_sigma=1.5 * model.markov_m,
         correlated_time=model.markov_s,
     )
-    made = Calibration(device=f"simulated {profile.name}", imu_noise=profile.noise, gnss_noise=gnss)
+    noise = PROFILES[scenario.profile]
+    made = Calibration(device=f"simulated {scenario.profile}", imu_noise=noise, gnss_noise=gnss)
     if (mag := scenario.magnetometer) is not None:  # correlated disturbances are simulated as passing iron only
         iron = MagnetometerNoise(sigma_ut=mag.sigma_ut, disturbance_ut=0.0, hard_iron_sigma_ut=mag.hard_iron_sigma_ut)
         made = replace(made, magnetometer_noise=iron)
@@ -278,24 +275,15 @@ def _calibration(scenario: Scenario) -> Calibration:
     return made
 
 
-def _within(trajectory: Trajectory, end: float) -> list[tuple[float, float]]:
-    return [(start, min(stop, end)) for start, stop in trajectory.rests if start < end]
-
-
-def _static(trajectory: Trajectory, t_ns: Times, sigma_m_s: float) -> StaticPeriod | None:
+def _static(motion: _Motion, sigma_m_s: float) -> StaticPeriod | None:
     """The standstills, from the first to the last inertial sample taken at rest."""
-    rests = _within(trajectory, float(t_ns[-1] - t_ns[0]) / NS)
+    rests, t_ns = motion.rests, motion.t_ns
     if not rests:
         return None
     start, end = (t_ns[0] + ns_from_seconds([rest[i] for rest in rests]) for i in range(2))
     first, last = np.searchsorted(t_ns, start), np.searchsorted(t_ns, end, side="right") - 1
     source = np.full(len(rests), "simulation", dtype=object)
     return StaticPeriod(t_ns=t_ns[first], t_end_ns=t_ns[last], sigma_v=np.full(len(rests), sigma_m_s), source=source)
-
-
-def _stop_rows(trajectory: Trajectory, t: Floats) -> Indices:
-    """The inertial sample in the middle of every standstill."""
-    return np.searchsorted(t, [(start + end) / 2 for start, end in _within(trajectory, float(t[-1]))])
 
 
 def reference(truth: Truth, t_ns: Times, biases: Biases, rows: Indices) -> Reference:

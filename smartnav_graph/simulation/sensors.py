@@ -8,9 +8,8 @@ Noise models: IEEE Std 952 (white noise and rate random walk).
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,55 +22,36 @@ from smartnav_graph.session.streams import Barometer, Imu, Magnetometer, Velocit
 from smartnav_graph.simulation.trajectory import Truth
 
 
-@dataclass(frozen=True)
-class DeviceProfile:
-    """A device and the noise its simulated sensors really have (the same on all three axes)."""
+def _at_rest(
+    accel_noise: Sequence[float], gyro_noise: Sequence[float], accel_bias: float, gyro_bias: float
+) -> ImuNoise:
+    """Noise of published sample sigmas by axis at 100 Hz: their quadratic mean, density = sigma / sqrt(100 Hz).
 
-    name: str
-    noise: ImuNoise
-
-
-def _profile(
-    name: str,
-    accel_noise: Sequence[float],
-    gyro_noise: Sequence[float],
-    accel_bias: float,
-    gyro_bias: float,
-    **walks: float,
-) -> DeviceProfile:
-    """Profile of published sample sigmas by axis at 100 Hz: their quadratic mean, density = sigma / sqrt(100 Hz).
-
-    Bias walks were not published; they are those of the class unless given.
+    Bias walks were not published; they are those of the class.
     """
     accel, gyro = (float(np.sqrt(np.mean(np.square(sigma)) / 100.0)) for sigma in (accel_noise, gyro_noise))
-    noise = dataclasses.replace(
+    return replace(
         DEVICE_CLASSES["mems"],
         accel_noise_density=accel,
         gyro_noise_density=gyro,
         accel_bias_sigma=accel_bias,
         gyro_bias_sigma=gyro_bias,
-        **walks,
     )
-    return DeviceProfile(name, noise)
 
 
 _MILLI_G = STANDARD_GRAVITY / 1000.0
+# Turn-on bias sigmas: quadratic mean of the one published bias (0.396, -0.068, 0.124) and (1.62, 0.68, -4.89) e-3.
+_GALAXY_S2 = _at_rest((0.0386, 0.0297, 0.0435), (2.20e-3, 2.52e-3, 3.08e-3), 0.24, 3.0e-3)
 
-PROFILES: dict[str, DeviceProfile] = {
-    "mems": DeviceProfile("mems", DEVICE_CLASSES["mems"]),
-    # Turn-on bias sigmas: quadratic mean of the one published bias (0.396, -0.068, 0.124) and (1.62, 0.68, -4.89) e-3.
-    "galaxy-s2": _profile("galaxy-s2", (0.0386, 0.0297, 0.0435), (2.20e-3, 2.52e-3, 3.08e-3), 0.24, 3.0e-3),
+# Noise that the simulated sensors of a device really have, the same on all three axes.
+PROFILES: dict[str, ImuNoise] = {
+    "mems": DEVICE_CLASSES["mems"],
+    "galaxy-s2": _GALAXY_S2,
     # The same phone as it warms up: its gyro was seen to drift in proportion to temperature, through zero at 40 of 33
     # to 48 deg C. 1e-4 rad/s/sqrt(s) is 3.5e-3 rad/s in 20 min; the published bias is 4.9e-3.
-    "galaxy-s2-warming": _profile(
-        "galaxy-s2-warming", (0.0386, 0.0297, 0.0435), (2.20e-3, 2.52e-3, 3.08e-3), 0.24, 3.0e-3, gyro_bias_walk=1e-4
-    ),
-    "galaxy-s5": _profile(
-        "galaxy-s5", (4.6 * _MILLI_G, 6.1 * _MILLI_G, 0.2 * _MILLI_G), (1.7e-3, 2.8e-3, 0.9e-3), 0.2, 3.0e-3
-    ),
-    "iphone-4": _profile(
-        "iphone-4", (2.8 * _MILLI_G, 2.4 * _MILLI_G, 4.2 * _MILLI_G), (4.8e-3, 3.2e-3, 4.3e-3), 0.2, 5.0e-3
-    ),
+    "galaxy-s2-warming": replace(_GALAXY_S2, gyro_bias_walk=1e-4),
+    "galaxy-s5": _at_rest((4.6 * _MILLI_G, 6.1 * _MILLI_G, 0.2 * _MILLI_G), (1.7e-3, 2.8e-3, 0.9e-3), 0.2, 3.0e-3),
+    "iphone-4": _at_rest((2.8 * _MILLI_G, 2.4 * _MILLI_G, 4.2 * _MILLI_G), (4.8e-3, 3.2e-3, 4.3e-3), 0.2, 5.0e-3),
 }
 
 

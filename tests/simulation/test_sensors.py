@@ -69,13 +69,13 @@ def test_noise_free_readings_are_the_truth():
 
 
 def test_profiles_hold_the_published_sigmas_as_densities():
-    s2, s5, i4 = (sensors.PROFILES[name].noise for name in ("galaxy-s2", "galaxy-s5", "iphone-4"))
+    s2, s5, i4 = (sensors.PROFILES[name] for name in ("galaxy-s2", "galaxy-s5", "iphone-4"))
     # quadratic mean of (0.0386, 0.0297, 0.0435) m/s^2 over sqrt(100 Hz), and so on
     assert s2.accel_noise_density == pytest.approx(3.770e-3, rel=1e-3)
     assert s2.gyro_noise_density == pytest.approx(2.625e-4, rel=1e-3)
     assert s5.accel_noise_density == pytest.approx(4.327e-3, rel=1e-3)
     assert i4.gyro_noise_density == pytest.approx(4.154e-4, rel=1e-3)
-    assert sensors.PROFILES["mems"].noise == DEVICE_CLASSES["mems"]
+    assert sensors.PROFILES["mems"] == DEVICE_CLASSES["mems"]
 
 
 def test_a_levelled_magnetometer_gives_the_heading():

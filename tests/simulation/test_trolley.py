@@ -81,7 +81,7 @@ def test_its_constants_are_frozen():
 
 
 def test_the_phone_is_the_galaxy_s2_but_for_the_drift_of_its_gyro():
-    usual, warming = PROFILES["galaxy-s2"].noise, PROFILES["galaxy-s2-warming"].noise
+    usual, warming = PROFILES["galaxy-s2"], PROFILES["galaxy-s2-warming"]
     assert replace(warming, gyro_bias_walk=usual.gyro_bias_walk) == usual
     assert warming.gyro_bias_walk * np.sqrt(1200.0) < 4.9e-3  # rad/s, the bias that was published
 

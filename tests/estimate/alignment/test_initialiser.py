@@ -34,7 +34,7 @@ from smartnav_graph.simulation.sensors import PROFILES, MagnetometerModel
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 
 NOISE = DEVICE_CLASSES["mems"]  # in motion
-PHONE = PROFILES["galaxy-s2"].noise  # at rest
+PHONE = PROFILES["galaxy-s2"]  # at rest
 ZERO = gtsam.imuBias.ConstantBias()
 
 # --- closed form ------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from smartnav_graph.simulation.sensors import PROFILES, imu
 from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 
 GRAVITY = 9.81
-PHONE = PROFILES["galaxy-s2"].noise
+PHONE = PROFILES["galaxy-s2"]
 
 
 def ride(trajectory, noise=PHONE, seed=0, hertz=100.0):
