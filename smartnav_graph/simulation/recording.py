@@ -72,9 +72,8 @@ class Scenario:
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
         motion, noise = _motion(self, seed), PROFILES[self.profile]
-        imu, biases = sensors.imu(
-            motion.truth, motion.t_ns, noise, frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m), motion.rng("imu")
-        )
+        gravity = frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m)
+        imu, biases = sensors.imu(motion.truth, motion.t_ns, noise, gravity, motion.rng("imu"))
         streams: dict[str, Stream | None] = {
             "gnss": _gnss(motion, self.gnss),
             "control": _control(motion) if self.control else None,
