@@ -16,6 +16,13 @@ from smartnav_graph.core.arrays import Floats, Indices, Times, runs
 from smartnav_graph.core.errors import SessionError
 
 NS = 1_000_000_000
+# Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
+_LEAP_DAYS = (
+    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
+    *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
+    *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+)
+_GPS_EPOCH_NS = int(np.datetime64("1980-01-06", "ns").astype(np.int64))
 
 
 def ns_from_text(text: str, unit_ns: int = NS) -> int:
@@ -154,3 +161,10 @@ def _joined(lines: Indices) -> list[tuple[int, int]]:
         else:
             joined.append((i, j))
     return joined
+
+
+def utc_from_gps(t_ns: Times) -> Times:
+    """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds subtracted."""
+    steps = np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64) + np.arange(1, len(_LEAP_DAYS) + 1) * 10**9
+    continuous = np.asarray(t_ns, dtype=np.int64) + _GPS_EPOCH_NS
+    return np.asarray(continuous - np.searchsorted(steps, continuous, side="right") * 10**9)

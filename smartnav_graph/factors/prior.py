@@ -18,10 +18,10 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.detect.stances import REST_SPEED
 
 UNKNOWN_ANGLE = float(np.pi / np.sqrt(3.0))
 UNKNOWN_PLACE = 1e5  # m
-REST_SPEED = 0.01  # m/s, of a device at rest
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,11 @@ from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
-from smartnav_graph.core.timebase import NS, seconds_since
+from smartnav_graph.core.timebase import NS, seconds_since, utc_from_gps
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.stream import Located, Positioned
 from smartnav_graph.session.streams import Imu, Streams
 
-GPS_EPOCH_S = 315_964_800
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
 MOUNTINGS = ("auto", "foot", "body")
@@ -145,8 +144,10 @@ class Session(Streams):
     @property
     def year(self) -> float:
         """Decimal year of time zero; 2025 where the clock is no date."""
-        unix_s = self.t0_ns / NS + (GPS_EPOCH_S if self.clock_epoch == "gps" else 0.0)
-        return 1970.0 + unix_s / (365.2425 * 86400.0) if self.clock_epoch in ("unix", "gps") else 2025.0
+        if self.clock_epoch not in ("unix", "gps"):
+            return 2025.0
+        unix_ns = int(utc_from_gps(np.array(self.t0_ns))) if self.clock_epoch == "gps" else self.t0_ns
+        return 1970.0 + unix_ns / NS / (365.2425 * 86400.0)
 
     @cached_property
     def magnetic_field_ut(self) -> Floats | None:

@@ -19,11 +19,12 @@ from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig, In
 from smartnav_graph.estimate.alignment.magnetic import FieldStart
 from smartnav_graph.estimate.alignment.pedestrian import Walk
 from smartnav_graph.estimate.alignment.static import LEAST_RATE_SIGMA, Rest, find_rest, rest_over
-from smartnav_graph.factors.prior import REST_SPEED, PriorBuilder, PriorConfig
+from smartnav_graph.factors.prior import PriorBuilder, PriorConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import ImuNoise
+from smartnav_graph.session.detect.stances import REST_SPEED
 from smartnav_graph.session.streams import Imu, Magnetometer
 
 # Tilt (rad) that levelling by the accelerometer may be off.

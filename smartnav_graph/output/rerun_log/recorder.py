@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from rerun.chunk import RrdReader
 
 from smartnav_graph.core.arrays import Times
+from smartnav_graph.core.timebase import utc_from_gps
 from smartnav_graph.estimate.result.diagnostics import window_of
 from smartnav_graph.output.rerun_log import colours
 
@@ -25,21 +26,7 @@ MOST_NUMBERS = 6.5
 # How many times larger than its data the range of a plot may become for a second tick label.
 MOST_ENLARGED = 1.7
 
-# Days on which TAI - UTC grew by one second since GPS time began (IERS Bulletin C).
-_LEAP_DAYS = (
-    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
-    *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
-    *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
-)
-_GPS_EPOCH_NS = int(np.datetime64("1980-01-06", "ns").astype(np.int64))
 _YEAR_2000_NS = int(np.datetime64("2000-01-01", "ns").astype(np.int64))
-
-
-def utc_from_gps(t_ns: Times) -> Times:
-    """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds subtracted."""
-    steps = np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64) + np.arange(1, len(_LEAP_DAYS) + 1) * 10**9
-    continuous = np.asarray(t_ns, dtype=np.int64) + _GPS_EPOCH_NS
-    return np.asarray(continuous - np.searchsorted(steps, continuous, side="right") * 10**9)
 
 
 @dataclass(frozen=True)

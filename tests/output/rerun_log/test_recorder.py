@@ -11,7 +11,7 @@ import pytest
 from recordings import EVALUATION, SUMMARY, T0, N, make_session, make_solution, replayed, stamps, write
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.timebase import NS, utc_from_gps
 from smartnav_graph.graph.solution import Residuals
 from smartnav_graph.output.rerun_log import recorder, viewer, write_recording
 
@@ -46,13 +46,13 @@ def test_raw_clock_stands_in_for_a_clock_that_is_no_date(tmp_path):
 
 def test_gps_time_is_shown_as_utc():
     # GPS week 2295, second 0 began 2023-12-31 00:00:00 GPS = 2023-12-30 23:59:42 UTC: 18 leap seconds since 2017.
-    shown = recorder.utc_from_gps(np.array([2295 * 604_800 * NS, 0]))
+    shown = utc_from_gps(np.array([2295 * 604_800 * NS, 0]))
     assert str(shown[:1].astype("datetime64[ns]")[0]).startswith("2023-12-30T23:59:42.000")
     assert shown[1] == np.datetime64("1980-01-06", "ns").astype(np.int64)
     # the last second of 2016 was a leap second: 17 s before it, 18 s after it
     epoch = np.datetime64("1980-01-06", "ns")
     gps = np.array(["2017-01-01T00:00:16", "2017-01-01T00:00:18"], "datetime64[ns]") - epoch
-    utc = recorder.utc_from_gps(gps.astype(np.int64)).astype("datetime64[ns]").astype("datetime64[s]")
+    utc = utc_from_gps(gps.astype(np.int64)).astype("datetime64[ns]").astype("datetime64[s]")
     assert [str(t) for t in utc] == ["2016-12-31T23:59:59", "2017-01-01T00:00:00"]
     assert not recorder.RecordingClock(46_534 * NS, "gps").is_date  # seconds of a day
 
