@@ -13,6 +13,7 @@ from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bar
 
 from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.output.text import duration
 
 # Seconds between two updates of the bar.
 PERIOD_S = 0.1
@@ -79,8 +80,4 @@ def counted(done: int, total: int, seconds: float) -> str:
 def time_text(seconds: float) -> str:
     """Seconds as text: ``2 s``, ``3 min 05 s``, ``1 h 02 min``."""
     whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole} s" if whole < 60 else duration(whole)

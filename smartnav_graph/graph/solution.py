@@ -42,6 +42,10 @@ class Residuals:
         """Mask of the rows of one sensor."""
         return np.asarray(self.sensor == sensor)
 
+    def sensors(self) -> list[str]:
+        """Names of the sensors with residuals, sorted."""
+        return sorted({str(name) for name in self.sensor})
+
     @classmethod
     def empty(cls) -> Residuals:
         none = np.zeros(0)

@@ -272,7 +272,7 @@ def read_run(path: str | Path) -> StoredRun:
         raise SessionError(path, found, "a run folder", "make one with `smartnav smooth`")
     try:
         summary: dict[str, object] = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-        frame = _Frame.of(table_of(summary, "session"))
+        frame = _frame(table_of(summary, "session"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(
             path / SUMMARY, f"cannot be read ({error!r})", "the summary of a run", "smooth the session again"
@@ -286,32 +286,15 @@ def read_run(path: str | Path) -> StoredRun:
     )
 
 
-@dataclass(frozen=True)
-class _Frame:
+def _frame(session: Mapping[str, Any]) -> dict[str, Any]:
     """What a solution needs of the session it was estimated from."""
-
-    t0_ns: int
-    origin: Origin | None
-    forward: str
-    up: str
-
-    @classmethod
-    def of(cls, session: Mapping[str, Any]) -> _Frame:
-        origin = session["origin"]
-        origin = None if origin is None else Origin(**origin)
-        return cls(int(session["t0_ns"]), origin, str(session["forward"]), str(session["up"]))
+    origin = None if session["origin"] is None else Origin(**session["origin"])
+    return {"t0_ns": int(session["t0_ns"]), "origin": origin} | {key: str(session[key]) for key in ("forward", "up")}
 
 
-def _read_states(path: Path, frame: _Frame, residuals: Residuals | None = None) -> Solution:
+def _read_states(path: Path, frame: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:
     try:
-        return solution_model.from_columns(
-            solution_model.read(path),
-            residuals=residuals,
-            t0_ns=frame.t0_ns,
-            origin=frame.origin,
-            forward=frame.forward,
-            up=frame.up,
-        )
+        return solution_model.from_columns(solution_model.read(path), residuals=residuals, **frame)
     except (OSError, KeyError, pa.ArrowException) as error:
         raise _unreadable(path, error) from error
 

@@ -9,7 +9,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.graph.solution import Solution
-from smartnav_graph.output.report.charts import Intervals, figure, over_time, shaded
+from smartnav_graph.output.report.charts import Intervals, core, figure, over_time, shaded
 from smartnav_graph.output.report.session_states import CLOCK, parts_of
 from smartnav_graph.output.report.svg import axis, finite_values, spread_axis
 from smartnav_graph.output.text import Row, Table, count, metres, number, plural
@@ -44,7 +44,7 @@ def draw(updates: Updates, solution: Solution, gaps: Intervals) -> str:
     work.line(t, updates.solved.astype(float), "s1")
     work.line(t, updates.relinearised.astype(float), "s0")
     cost = over_time(
-        solution, axis(_core(updates.latency_ms), include=(0.0,), count=4), "Computing time [ms]", gaps, 130
+        solution, axis(core(updates.latency_ms, 2.0), include=(0.0,), count=4), "Computing time [ms]", gaps, 130
     )
     cost.line(t, updates.latency_ms, "s3")
     entries = [("line s1", "States solved for"), ("line s0", "States relinearised, all iterations"), *shaded(gaps)]
@@ -65,16 +65,10 @@ def _clocks(updates: Updates, solution: Solution, gaps: Intervals) -> str:
             continue
         value, sigma = 1e3 * rows.T
         (part,) = parts_of(name, 1)
-        limits = axis(_core(np.concatenate([value - sigma, value + sigma])), count=4)
+        limits = axis(core(np.concatenate([value - sigma, value + sigma]), 2.0), count=4)
         plot = over_time(solution, limits, f"{part.label} [ms]", gaps, 130)
         plot.band(t, value - sigma, value + sigma, "s0")
         plot.line(t, value, "s0")
         plots.append(plot)
     marks = [("line s0", "Clock offset, causal"), ("band s0", "± 1 sigma"), *shaded(gaps)]
     return figure(plots, marks) if plots else ""
-
-
-def _core(values: Floats) -> Floats:
-    """All but the most extreme 2 % on either side."""
-    v = finite_values(values)
-    return np.percentile(v, [2, 98]) if len(v) else v

@@ -34,6 +34,7 @@ class Scored(Protocol):
 
 
 MOST_FAR = 6.0  # whitened residuals beyond are drawn at the edge and counted
+RESIDUAL_AXIS = Axis(-MOST_FAR, MOST_FAR, (-6.0, -3.0, 0.0, 3.0, 6.0), ("−6", "−3", "0", "3", "6"))
 
 
 def figure(plots: Sequence[Plot], entries: Sequence[tuple[str, str]] = (), note: str = "") -> str:
@@ -94,7 +95,7 @@ def motion(solution: Solution, gaps: Intervals) -> str:
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
     title = "Height above the ellipsoid [m]" if known else "Height above the local origin [m]"
     sigma = solution.sigmas[:, POS][:, 2]
-    band = _core(np.concatenate([height - sigma, height + sigma]))
+    band = core(np.concatenate([height - sigma, height + sigma]))
     whole = np.ptp(band) < 10 * max(float(np.ptp(height)), 1.0) if len(band) else False
     high = over_time(solution, axis(np.concatenate([height, band]) if whole else height, least=0.5), title, gaps)
     high.band(t, height - sigma, height + sigma, "s0")
@@ -147,7 +148,7 @@ def biases(solution: Solution, gaps: Intervals) -> str:
     for name, unit, bias, spread in sensors:
         low, high = bias - 3 * spread, bias + 3 * spread
         for i, letter in enumerate("xyz"):
-            y = axis(_core(np.stack([low[:, i], high[:, i]])), count=5)
+            y = axis(core(np.stack([low[:, i], high[:, i]])), count=5)
             plot = Plot(time_axis(float(t[0]), float(t[-1]), 4), y, f"{name} bias {letter} over time", height_px=140)
             plot.y_title = f"{name} {letter} [{unit}]"
             plot.spans(gaps)
@@ -160,21 +161,17 @@ def biases(solution: Solution, gaps: Intervals) -> str:
     return legend(marks) + grid(figures) + note
 
 
-def _core(values: Floats) -> Floats:
-    """The range of a y axis: without the most extreme 1 % on either side."""
+def core(values: Floats, cut: float = 1.0) -> Floats:
+    """The range of a y axis: without the most extreme `cut` % on either side."""
     v = finite_values(values)
-    return np.percentile(v, [1, 99]) if len(v) else v
-
-
-def residual_sensors(solution: Solution) -> list[str]:
-    return sorted({str(name) for name in solution.residuals.sensor})
+    return np.percentile(v, [cut, 100 - cut]) if len(v) else v
 
 
 def residual_histograms(solution: Solution) -> str:
     """Whitened residuals that were used, against the standard normal density."""
     r = solution.residuals
     figures = []
-    for sensor in residual_sensors(solution):
+    for sensor in solution.residuals.sensors():
         white = finite_values(r.whitened[r.of(sensor) & r.used])
         if len(white):
             figures.append(_histogram(sensor, white))
@@ -201,7 +198,7 @@ def _histogram(sensor: str, white: Floats) -> str:
 def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
     """Whitened residuals of each sensor over time, rejected ones marked."""
     plots, far, rejected = list[Plot](), list[str](), False
-    for sensor in residual_sensors(solution):
+    for sensor in solution.residuals.sensors():
         plots.append(_residual_plot(solution, sensor, gaps))
         r = solution.residuals
         rows = r.of(sensor) & np.isfinite(r.whitened)
@@ -214,9 +211,9 @@ def residuals_over_time(solution: Solution, gaps: Intervals) -> str:
 
 
 def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
-    r, t = solution.residuals, solution.seconds
+    r = solution.residuals
     seconds = (r.t_ns - solution.t0_ns) / 1e9
-    plot = Plot(time_axis(float(t[0]), float(t[-1])), _residual_axis(), f"{sensor} residuals over time")
+    plot = Plot(time_of(solution), RESIDUAL_AXIS, f"{sensor} residuals over time")
     plot.height_px, plot.y_title = 110, f"{title_of(sensor)}, residual / sigma"
     plot.spans(gaps)
     for level in (-3.0, 3.0):
@@ -228,10 +225,6 @@ def _residual_plot(solution: Solution, sensor: str, gaps: Intervals) -> Plot:
         shown = thin_dots(np.abs(y) > 3.0, 1500)
         plot.dots(seconds[rows][shown], y[shown], cls)
     return plot
-
-
-def _residual_axis() -> Axis:
-    return Axis(-MOST_FAR, MOST_FAR, (-6.0, -3.0, 0.0, 3.0, 6.0), ("−6", "−3", "0", "3", "6"))
 
 
 def distribution(errors: ArrayLike, what: str) -> str:

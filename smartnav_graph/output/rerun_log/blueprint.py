@@ -258,9 +258,8 @@ def _clocks(recorder: Recorder) -> Names:
 def _residuals(recorder: Recorder, solution: Solution | None) -> list[View]:
     if solution is None:
         return []
-    sensors = signals.sensors_of(solution.residuals)
     # Position sensors first: the inertial residuals are many and small.
-    sensors.sort(key=lambda name: (name.startswith(("imu", "prior")), name))
+    sensors = sorted(solution.residuals.sensors(), key=lambda name: (name.startswith(("imu", "prior")), name))
     return [
         series_view(
             f"Residuals {title_of(name)} (σ)",

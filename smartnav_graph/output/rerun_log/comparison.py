@@ -77,8 +77,6 @@ def write_comparison(
         _log_plots(recorder, comparison, names)
         _log_largest(recorder, comparison, extent)
         if report_markdown is not None:
-            import rerun as rr
-
             recorder.static("/report", rr.TextDocument(report_markdown, media_type=rr.MediaType.MARKDOWN))
         stream.send_blueprint(_blueprint(recorder, comparison, names, extent, factor))
 

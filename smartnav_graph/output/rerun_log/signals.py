@@ -158,14 +158,9 @@ def residual_rows(residuals: Residuals, sensor: str, used: bool) -> tuple[Times,
     return keys[:, 0], table
 
 
-def sensors_of(residuals: Residuals) -> list[str]:
-    """Names of the sensors with residuals, sorted."""
-    return sorted({str(name) for name in residuals.sensor})
-
-
 def log_residuals(recorder: Recorder, residuals: Residuals) -> None:
     """Whitened residuals by sensor: /residuals/<sensor>, and those not used at /residuals/<sensor>/rejected."""
-    for sensor in sensors_of(residuals):
+    for sensor in residuals.sensors():
         path = f"/residuals/{sensor}"
         used, rejected = (residual_rows(residuals, sensor, kind) for kind in (True, False))
         width = used[1].shape[1]
