@@ -31,7 +31,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "match": ("match", "Match", "match or track points in the images of a session; compare features"),
     "smooth": ("runs", "Smooth", "compute the trajectory of a session (batch smoothing)"),
     "replay": ("runs", "Replay", "compute the causal trajectory of a session, one window at a time"),
-    "evaluate": ("scores", "Evaluate", "compare a run with a reference trajectory"),
+    "evaluate": ("inspection", "Evaluate", "compare a run with a reference trajectory"),
     "intervals": ("intervals", "Intervals", "drift between fixes (simulated outages)"),
     "explain": ("inspection", "Explain", "explain which measurements determine the state of a run at one epoch"),
     "compare": ("inspection", "Compare", "compare a run with another run"),

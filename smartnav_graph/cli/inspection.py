@@ -1,22 +1,90 @@
-"""Commands that inspect runs: explain a state, compare two runs."""
+"""Commands that inspect runs: compare a run with a reference, explain a state, compare two runs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from smartnav_graph.cli.options import Command, RunPath, Switch
+from smartnav_graph.cli.options import Reporting, RunPath, Switch
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.cli.text import print_json
+from smartnav_graph.cli.text import statistics_line
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing
+from smartnav_graph.evaluation import Evaluation, evaluate
 from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.readers.reference import load_reference
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain(Command):
+class Evaluate(Reporting):
+    """Compare a run with a reference trajectory: absolute and relative errors, percentiles, consistency (NEES).
+
+    Example: smartnav evaluate walk-run --reference walk --align yaw --json
+    """
+
+    run_path: RunPath
+    """Run folder."""
+    reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """TUM, EuRoC ground truth, KITTI poses, CSV with t, x, y, z named, or a session folder."""
+    times: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Times of KITTI poses."""
+    body_T_ref: Annotated[Path | None, tyro.conf.arg(name="body-T-ref", metavar="FILE")] = None
+    """TOML with the pose of the reference's frame in the body, a 4x4 matrix body_T_<name>."""
+    align: Literal["none", "yaw", "se3", "sim3"] = "none"
+    """Transformation to estimate before comparing."""
+    solution: Literal["smoothed", "causal"] = "smoothed"
+    """Solution of a replay."""
+    time_offset: Annotated[str, tyro.conf.arg(metavar="S|auto")] = "0"
+    """Added to the time stamps of the reference; auto estimates it."""
+
+    def run(self) -> None:
+        offset = _offset(self.time_offset)
+        with progress(self.quiet) as show:
+            show(f"reading {self.reference}", 0, 0)
+            reference = load_reference(self.reference, times=self.times, body_T_ref=self.body_T_ref)
+            solution = read_run(self.run_path).named(self.solution)
+            show("comparing", 0, 0)
+            found = evaluate(
+                solution,
+                reference,
+                align=self.align,
+                time_offset_s=offset,
+                solution_name=self.solution,
+                reference_name=str(self.reference),
+            )
+        self.report(found.to_dict(), evaluation_text(found))
+
+
+def _offset(text: str) -> float | Literal["auto"]:
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError as error:
+        raise ConfigError("--time-offset", repr(text), "seconds, or auto") from error
+
+
+def evaluation_text(found: Evaluation) -> str:
+    """The figures of an evaluation as text."""
+    rotation = None if found.rotation_deg is None else asdict(found.rotation_deg)
+    lines = [
+        f"{found.solution} against {found.reference}: {found.matched} epochs matched, {found.unmatched} outside; "
+        f"alignment {found.align}, time offset {found.time_offset_s:.4f} s",
+        statistics_line("position", "m", asdict(found.ape_m)),
+        statistics_line("rotation", "deg", rotation),
+    ]
+    for row in found.rpe:
+        if row.translation_m is not None:
+            turn = "" if row.rotation_deg is None else f", {row.rotation_deg:.3f} deg"
+            lines.append(f"over {row.delta_s:g} s{'':<4}{row.translation_m:.3f} m{turn} ({row.pairs} pairs)")
+    nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
+    lines += [f"NEES        {nees} (expected 3; yaw 1)"] if nees else []
+    return "\n".join([*lines, *found.notes])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain(Reporting):
     """Explain which measurements determine the state at one epoch: variance by source, what is not observable without
     a source, shift of the estimate by source, and the nearest data gap, rejection and standstill.
 
@@ -27,8 +95,6 @@ class Explain(Command):
     """Run folder."""
     at: Annotated[float | None, tyro.conf.arg(metavar="T")] = None
     """Time in seconds from the session's start; by default that of the largest position uncertainty."""
-    json: Switch = False
-    """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
         from smartnav_graph.output.explain import explain
@@ -36,14 +102,11 @@ class Explain(Command):
         with progress(self.quiet) as show:
             show(f"reading {self.run_path}", 0, 0)
             found = explain(read_run(self.run_path), self.at)
-        if self.json:
-            print_json(found.to_dict())
-        else:
-            print(found.to_text())
+        self.report(found.to_dict(), found.to_text())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Command):
+class Compare(Reporting):
     """Compare a run with another run: differences of states and sigmas, options, rejected measurements and summary
     figures; as a table, and with --out as one recording for the Rerun viewer.
 
@@ -58,8 +121,6 @@ class Compare(Command):
     """Also write one recording (.rrd): both paths, and their differences over time."""
     force: Switch = False
     """Replace the file."""
-    json: Switch = False
-    """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
         from smartnav_graph.output.run_comparison import compare_runs
@@ -72,9 +133,5 @@ class Compare(Command):
             if self.out is not None:
                 show("writing the recording", 0, 0)
                 found.write_recording(self.out, force=self.force)
-        if self.json:
-            print_json(found.to_dict())
-            return
-        print(found.to_text())
-        if self.out is not None:
-            print(f"recording: {self.out}")
+        recording = "" if self.out is None else f"\nrecording: {self.out}"
+        self.report(found.to_dict(), found.to_text() + recording)

@@ -11,9 +11,8 @@ import numpy as np
 import tyro
 
 from smartnav_graph import readers
-from smartnav_graph.cli.options import SessionCommand, Switch, repairs
+from smartnav_graph.cli.options import Reporting, SessionCommand, Switch, repairs
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.cli.text import print_json
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.evaluation.intervals import FixesFromReference, Interval, intervals
 from smartnav_graph.readers.reference import load_reference
@@ -22,7 +21,7 @@ from smartnav_graph.session.streams import Reference
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intervals(SessionCommand):
+class Intervals(SessionCommand, Reporting):
     """Drift between fixes (simulated outages): replay the session with a fix every few seconds, and compare the
     trajectory between the fixes with a reference: mean, 67 %, 95 % and RMS of the error.
 
@@ -43,8 +42,6 @@ class Intervals(SessionCommand):
     """Delay of these fixes, seconds (delayed measurements)."""
     seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Number of noise realisations, seeds 0 to N - 1."""
-    json: Switch = False
-    """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
         session = readers.load(self.session, repairs=repairs(self.repair))
@@ -56,10 +53,7 @@ class Intervals(SessionCommand):
                 session, reference, every, generated=generated, seeds=self.seeds, config=config, progress=show
             )
             found = list(rows)
-        if self.json:
-            print_json([row.to_dict() for row in found])
-        else:
-            print(intervals_text(found))
+        self.report([row.to_dict() for row in found], intervals_text(found))
 
     def _reference(self, session: Session) -> Reference:
         """The reference; that of the session where both are the same log."""

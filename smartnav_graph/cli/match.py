@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from smartnav_graph import readers
-from smartnav_graph.cli.options import Command, SourceName, Switch, Text, names
+from smartnav_graph.cli.options import Reporting, SourceName, Switch, Text, names
 from smartnav_graph.cli.progress import progress
-from smartnav_graph.cli.text import print_json
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
 from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.readers.reference import load_reference
@@ -33,7 +32,7 @@ FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Match(Command):
+class Match(Reporting):
     """Match points in the images of a session, or track them; the result is stored in the session, and a second call
     with the same options reads it again.
 
@@ -78,8 +77,6 @@ class Match(Command):
     """Number of parallel processes; 0 for one on each processor."""
     force: Switch = False
     """Replace an older result."""
-    json: Switch = False
-    """Print JSON, and nothing else, on stdout."""
 
     def run(self) -> None:
         asked = {"--from-file": self.from_file, "--to-file": self.to_file, "--map": self.map}
@@ -105,12 +102,10 @@ class Match(Command):
         config = self._config(self.features or "orb", "1,2,4,8", self.rate)
         with progress(self.quiet) as show:
             found = match_store.match(self.session, config, force=self.force, workers=self.workers, progress=show)
-        if self.json:
-            print_json({"computed": found.computed} | asdict(found.report))
-            return
-        print(found.report.to_text())
         name = "tracks" if config.tracks else "matches"
-        print(f"{name}: {Path(self.session) / name}.parquet{'' if found.computed else ', read from an earlier call'}")
+        where = f"{Path(self.session) / name}.parquet{'' if found.computed else ', read from an earlier call'}"
+        figures = {"computed": found.computed} | asdict(found.report)
+        self.report(figures, f"{found.report.to_text()}\n{name}: {where}")
 
     def _benchmark(self) -> None:
         asked = names(self.features) or tuple(kinds.available())
@@ -121,7 +116,7 @@ class Match(Command):
         with progress(self.quiet) as show:
             found = scores.compare_features(session, asked, config, workers=self.workers, progress=show)
         if self.json:
-            print_json([one.to_dict() for one in found])
+            self.report([one.to_dict() for one in found], "")
         else:
             print_scores(found, all_known=self.features is None)
 
@@ -135,11 +130,8 @@ class Match(Command):
         matches, lost = match_file.to_matches(rows, session.images, name, camera)
         report = {"from_file": str(path), "rows": len(rows.t0_ns), "matches": len(matches), "rows_without_images": lost}
         match_store.store(folder, matches, {"from_file": path.name, "camera": name}, report)
-        if self.json:
-            print_json(report)
-            return
-        print(f"{path}: {len(rows.t0_ns)} rows, {len(matches)} matches, {lost} rows without two images")
-        print(f"matches: {folder / 'matches.parquet'}")
+        counts = f"{path}: {len(rows.t0_ns)} rows, {len(matches)} matches, {lost} rows without two images"
+        self.report(report, f"{counts}\nmatches: {folder / 'matches.parquet'}")
 
     def _to_file(self, path: Path) -> None:
         session = session_folder.load(self.session)
@@ -149,10 +141,7 @@ class Match(Command):
         mine = session.images.image_id[session.images.camera == name]
         matches = session.matches.take(match_file.of_images(session.matches, mine))
         match_file.write_match_file(matches, path, camera, force=self.force)
-        if self.json:
-            print_json({"to_file": str(path), "matches": len(matches)})
-        else:
-            print(f"{path}: {len(matches)} matches of {name}")
+        self.report({"to_file": str(path), "matches": len(matches)}, f"{path}: {len(matches)} matches of {name}")
 
     def _map(self, path: Path) -> None:
         folder = Path(self.session)
@@ -164,11 +153,7 @@ class Match(Command):
         report = {**found.counts, "metres_a_unit": found.similarity.scale, "sigma_m": float(found.similarity.sigma)}
         report["turn_sigma_deg"] = float(np.degrees(found.similarity.rotation_sigma).max())
         match_store.store(folder, found.fixes, {"map": str(path), "known": str(self.known or "gnss")}, report)
-        if self.json:
-            print_json(report)
-            return
-        print(map_text(path, report))
-        print(f"pose fixes: {folder / 'pose_fixes.parquet'}")
+        self.report(report, f"{map_text(path, report)}\npose fixes: {folder / 'pose_fixes.parquet'}")
 
     @staticmethod
     def _known(path: Path, session: Session) -> KnownPositions:

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from json import dumps
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -13,6 +14,7 @@ import tyro
 
 from smartnav_graph.estimate import config as config_model
 from smartnav_graph.estimate.config import Config
+from smartnav_graph.output.summary_json import plain
 from smartnav_graph.session import repair as repair_model
 
 Switch = tyro.conf.FlagCreatePairsOff[bool]
@@ -40,6 +42,18 @@ class Command:
     def run(self) -> None:
         """Execute the command."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reporting(Command):
+    """A command that prints figures."""
+
+    json: Switch = False
+    """Print JSON, and nothing else, on stdout."""
+
+    def report(self, figures: object, text: str) -> None:
+        """Print the figures as JSON, or the text."""
+        print(dumps(plain(figures), allow_nan=False) if self.json else text)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
-from smartnav_graph.output.summary_json import Summary, imu_gaps, list_of, numbers_of, plain, table_of, text_of
+from smartnav_graph.output.summary_json import Summary, imu_gaps, list_of, numbers_of, table_of, text_of
 from smartnav_graph.session.session import Session
 
 STYLES = {"error:": "bold red", "warning:": "yellow", "missing:": "cyan"}
@@ -33,11 +32,6 @@ def session_text(session: Session) -> str:
     for name, counts in session.dropped.items():
         lines += [f"repaired: {name}: {count} {reason}" for reason, count in counts.items()]
     return "\n".join(lines)
-
-
-def print_json(value: object) -> None:
-    """JSON on stdout."""
-    print(json.dumps(plain(value), allow_nan=False))
 
 
 def run_text(summary: Summary, out: Path) -> str:

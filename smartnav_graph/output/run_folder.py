@@ -296,7 +296,7 @@ def _read_states(path: Path, frame: Mapping[str, Any], residuals: Residuals | No
     try:
         return solution_model.from_columns(solution_model.read(path), residuals=residuals, **frame)
     except (OSError, KeyError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
 
 
 def _read_residuals(path: Path) -> Residuals:
@@ -305,10 +305,11 @@ def _read_residuals(path: Path) -> Residuals:
         renamed = {("whitened" if name == "residual" else name): column for name, column in columns.items()}
         return Residuals(**renamed)
     except (OSError, TypeError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
 
 
-def _unreadable(path: Path, error: Exception) -> SessionError:
+def unreadable(path: Path, error: Exception) -> SessionError:
+    """The error of a table of a run that cannot be read."""
     return SessionError(path, f"cannot be read ({error})", "a table of a run", "smooth the session again")
 
 

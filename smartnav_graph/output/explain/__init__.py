@@ -17,7 +17,7 @@ from smartnav_graph.graph.solution import POS
 from smartnav_graph.output.explain.figures import Explanation
 from smartnav_graph.output.explain.nearby import Nearby, nearby
 from smartnav_graph.output.explain.sentences import sentences, variance_table
-from smartnav_graph.output.run_folder import StoredRun
+from smartnav_graph.output.run_folder import StoredRun, unreadable
 
 __all__ = ["Explained", "Explanation", "explain"]
 
@@ -67,10 +67,7 @@ def _read(run: StoredRun) -> Influence:
     try:
         return Influence.read(run.path)
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        where = run.path / FACTORS
-        raise SessionError(
-            where, f"cannot be read ({error})", "a table of a run", "smooth the session again"
-        ) from error
+        raise unreadable(run.path / FACTORS, error) from error
 
 
 def _checked(run: StoredRun, at_s: float) -> int:

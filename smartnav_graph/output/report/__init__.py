@@ -77,7 +77,7 @@ def report_markdown(summary: Summary, evaluation: Evaluation | None = None) -> s
         ("Withheld measurements", "", usage.withheld_table(summary)),
     ]
     if evaluation is not None:
-        compared = reference.figures(evaluation)
+        compared = evaluation.to_dict()
         title, sentence = "Comparison with the reference", reference.matched_sentence(compared)
         tables.append((title, sentence, reference.absolute_table(compared)))
     tables += [

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import math
 
-from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.output.summary_json import Summary, as_float, numbers_of, rows_of, table_of, text_of
 from smartnav_graph.output.text import Row, Table, capital, listed, number, plural, seconds
-
-
-def figures(evaluation: Evaluation | None) -> Summary:
-    """The evaluation as its JSON table; empty when there is none."""
-    return {} if evaluation is None else evaluation.to_dict()
 
 
 def matched_sentence(compared: Summary) -> str:

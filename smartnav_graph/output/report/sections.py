@@ -252,7 +252,7 @@ def against_reference(evaluation: Evaluation | None, solution: Solution, gaps: c
     """Errors against a reference trajectory."""
     if evaluation is None:
         return ""
-    compared = reference.figures(evaluation)
+    compared = evaluation.to_dict()
     horizontal = np.linalg.norm(evaluation.error_enu_m[:, :2], axis=1)
     tables = [reference.absolute_table(compared), reference.relative_table(compared), reference.nees_table(compared)]
     body = f"<p>{escape(reference.matched_sentence(compared))}</p>" + "".join(t.html() for t in tables if t)

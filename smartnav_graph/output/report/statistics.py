@@ -11,17 +11,7 @@ from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.report.facts import Uncertainty, withheld_counts
 from smartnav_graph.output.summary_json import Summary, numbers_of, table_of
-from smartnav_graph.output.text import (
-    Row,
-    Table,
-    count,
-    distance,
-    duration,
-    fixed,
-    metres,
-    number,
-    plural,
-)
+from smartnav_graph.output.text import Row, Table, count, distance, duration, fixed, metres, number, plural
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Imu
 
@@ -115,14 +105,9 @@ def _motion(solution: Solution) -> list[tuple[str, str]]:
     known = solution.origin is not None
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
     above = "ellipsoidal" if known else "above the local origin"
-    rows = [
-        (
-            "Largest speed",
-            f"{number(speed[fastest])} m/s ({fixed(3.6 * speed[fastest], 0)} km/h) at {fixed(t[fastest], 1)} s",
-        ),
-        (f"Height, {above}", f"{fixed(height.min(), 2)} to {fixed(height.max(), 2)} m"),
-    ]
-    return rows
+    largest = f"{number(speed[fastest])} m/s ({fixed(3.6 * speed[fastest], 0)} km/h) at {fixed(t[fastest], 1)} s"
+    heights = f"{fixed(height.min(), 2)} to {fixed(height.max(), 2)} m"
+    return [("Largest speed", largest), (f"Height, {above}", heights)]
 
 
 def _slow(solution: Solution) -> list[tuple[str, str]]:

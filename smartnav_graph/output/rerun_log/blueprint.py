@@ -44,8 +44,8 @@ _UPDATES: Names = (
     ("Updates: states (latency ms in latency.rrd)", "/update/effort"),
     ("Change of earlier states m", "/update/change"),
     ("Rejected measurements by update", "/update/rejected"),
+    ("Matches of image pairs", "/pairs/matches"),
 )
-_PAIRS: Names = (("Matches of image pairs", "/pairs/matches"),)
 
 # The viewer's vertical opening angle, a picture 1.6 times as wide as high, and the share of it that is filled.
 OPENING_DEG, ASPECT, FILLED = 55.0, 1.6, 0.85
@@ -237,7 +237,7 @@ def _right(recorder: Recorder, session: Session, solution: Solution | None, kind
         shown,
         _tabs(series(_ACCURACY)),
         _tabs(series(_BIASES) + series(_clocks(recorder))),
-        _tabs([*series(_UPDATES), *series(_PAIRS), *_residuals(recorder, solution)]),
+        _tabs([*series(_UPDATES), *_residuals(recorder, solution)]),
         states,
         log,
     ]
