@@ -161,10 +161,10 @@ def biases(solution: Solution, gaps: Intervals) -> str:
     return legend(marks) + grid(figures) + note
 
 
-def core(values: Floats, cut: float = 1.0) -> Floats:
-    """The range of a y axis: without the most extreme `cut` % on either side."""
+def core(values: Floats, percent: float = 1.0) -> Floats:
+    """The range of a y axis: without the most extreme `percent` % on either side."""
     v = finite_values(values)
-    return np.percentile(v, [cut, 100 - cut]) if len(v) else v
+    return np.percentile(v, [percent, 100 - percent]) if len(v) else v
 
 
 def residual_histograms(solution: Solution) -> str:
