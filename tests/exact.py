@@ -101,23 +101,23 @@ def record(
 
 @dataclass(frozen=True)
 class Graph:
-    """Windows, builders by name, and the factors of every step at given states."""
+    """Windows, builders by name, and the factors of every update at given states."""
 
     windows: Sequence[Window]
     builders: dict[str, Any]
-    steps: Sequence[Any]
+    updates: Sequence[Any]
     values: Any
 
     def factors(self, *sensors: str) -> list[tuple[FactorId, Any]]:
         """Tagged factors of these sensors."""
-        return [item for step in self.steps for item in step.factors if item[0].sensor in sensors]
+        return [item for update in self.updates for item in update.factors if item[0].sensor in sensors]
 
     def rows(self, *sensors: str) -> list[tuple[FactorId, Any]]:
         """Tagged rows of the blocks of these sensors, each as a factor of its own without loss."""
         return [
-            (FactorId(block.sensor, block.t_ns, row), custom_factor(replace(block, loss="none"), i, step.held))
-            for step in self.steps
-            for block in step.blocks
+            (FactorId(block.sensor, block.t_ns, row), custom_factor(replace(block, loss="none"), i, update.held))
+            for update in self.updates
+            for block in update.blocks
             if block.sensor in sensors
             for i, row in enumerate(block.rows)
         ]
@@ -135,7 +135,7 @@ def assemble(
     known: Mapping[str, Any] = MappingProxyType({}),
     options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Graph:
-    """The graph of `session` with every step built at the states that `truth` and `bias` tell; `known` are the true
+    """The graph of `session` with every update built at the states that `truth` and `bias` tell; `known` are the true
     values of session states by name, the others stand at their initial ones; `options` are sections of the config."""
     keyframes = keyframes or KeyframeConfig()
     imu = session.require_imu()
@@ -148,17 +148,17 @@ def assemble(
     builders = {builder.name: builder for builder in make_builders(context)}
     there, biases = truth(times), bias(times)
     states = [state(there, k, int(t), biases[k]) for k, t in enumerate(times)]
-    steps = [
+    updates = [
         build_update(w, states[k - 1] if k else None, builders.values(), pass_state or PassState(), int(times[0]))
         for k, w in enumerate(windows)
     ]
     values = values_of(states)
-    for step in steps:
-        own = {s.key: known.get(s.name, s.initial) for s in step.session.values()} | step.chain
+    for update in updates:
+        own = {s.key: known.get(s.name, s.initial) for s in update.session.values()} | update.chain
         for name, value in own.items():
             if not values.exists(name):
                 values.insert(name, np.asarray(value, dtype=np.float64))
-    return Graph(windows, builders, steps, values)
+    return Graph(windows, builders, updates, values)
 
 
 def state(truth: Truth, row: int, t_ns: int, bias: np.ndarray) -> State:
@@ -186,8 +186,8 @@ def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
         indices=range(n),
         t_ns=np.array([w.t1_ns for w in graph.windows], dtype=np.int64),
         covariance=np.zeros((n, 15, 15)) if covariance is None else covariance,
-        factors=[item for step in graph.steps for item in step.factors],
-        blocks=[block for step in graph.steps for block in step.blocks],
+        factors=[item for update in graph.updates for item in update.factors],
+        blocks=[block for update in graph.updates for block in update.blocks],
         iterations=1,
         converged=True,
         cost=0.0,

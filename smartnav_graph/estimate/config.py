@@ -78,7 +78,7 @@ class GeneralConfig:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
 
-_OF_FACTORS = {factor.section: factor.config for factor in FACTORS.values() if factor.config is not None}
+_OF_FACTORS = {factor.section: factor.config for factor in FACTORS.values()}
 FactorConfigs: Any = dataclasses.make_dataclass(
     "FactorConfigs",
     [(section, kind, field(default_factory=kind)) for section, kind in _OF_FACTORS.items()],

@@ -13,12 +13,8 @@ from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import StageTimes, run_pass, solve_passes
 from smartnav_graph.estimate.problem import TOO_LATE, Problem, batch_problem, prepare
-from smartnav_graph.estimate.result.assemble import (
-    carried_over,
-    causal_solution,
-)
+from smartnav_graph.estimate.result.assemble import SolvedProblem, carried_over, causal_solution
 from smartnav_graph.estimate.result.diagnostics import UpdateLog
-from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.run import Run, _finish, initialise
 from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase

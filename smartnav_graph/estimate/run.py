@@ -17,6 +17,7 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import StageTimes, causal_start, solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
 from smartnav_graph.estimate.result.assemble import (
+    SolvedProblem,
     Withheld,
     resample,
     score_holdout,
@@ -24,7 +25,6 @@ from smartnav_graph.estimate.result.assemble import (
     used_counts,
 )
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
-from smartnav_graph.estimate.result.solved import SolvedProblem
 from smartnav_graph.estimate.result.summary import summarise
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph.pass_state import PassState
@@ -108,23 +108,14 @@ def _finish(
     causal: Solution | None = None,
     updates: Updates | None = None,
 ) -> Run:
-    problem, estimate = solved.problem, solved.estimate
+    problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     keyframes = to_solution(solved)
     withheld = score_holdout(problem, keyframes, estimate)
     solution = resample(problem, keyframes)
     clock.lap("assemble")
     summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)
-    diagnostics = Diagnostics.of(problem, estimate, solved.pass_state, updates)
-    return Run(
-        problem,
-        solution,
-        summary,
-        causal,
-        withheld,
-        diagnostics=diagnostics,
-        estimate=estimate,
-        pass_state=solved.pass_state,
-    )
+    diagnostics = Diagnostics.of(problem, estimate, pass_state, updates)
+    return Run(problem, solution, summary, causal, withheld, (), diagnostics, estimate, pass_state)
 
 
 def _refuse_empty(problem: Problem, pass_state: PassState) -> None:

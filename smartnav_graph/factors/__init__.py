@@ -9,7 +9,8 @@ sigma of a model assumption or of a prior in the module of its factor, in its `C
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from smartnav_graph.factors import (
     barometer,
@@ -30,123 +31,95 @@ from smartnav_graph.factors import (
     wheel,
 )
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.table import Factor
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.session.detect.standstills import StandstillConfig
 from smartnav_graph.session.stream import Label
 from smartnav_graph.session.streams import STREAMS
 
+Build = Callable[[FactorContext], Builder | None]
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One row of `FACTORS`.
+
+    build : makes the builder, None where a session has no use for it; the prior has none, the initialisation makes it
+    config, section : class of its options and name of their section in config.toml; a section may serve several factors
+    stream : the stream that it reads, if any
+    label : title and colour
+    parts : labels of its factors that carry a name of their own, such as the bias random walk of the inertial data
+    """
+
+    build: Build | None
+    config: type[object]
+    section: str
+    label: Label
+    stream: str | None = None
+    parts: Mapping[str, Label] = field(default_factory=dict)
+
+
+def _of(stream: str, build: Build, config: type[object], section: str = "", **parts: Label) -> Factor:
+    """The factor that goes by the name of its stream, as its section does where none is given."""
+    return Factor(build, config, section or stream, STREAMS[stream].LABEL, stream, parts)
+
+
 # The inertial builder comes first: it predicts the state that the others refer to.
 FACTORS: Mapping[str, Factor] = {
     "prior": Factor(
+        *(None, prior.PriorConfig, "prior"),
         Label("Initial state", assumes="prior on the initial state", colour=(150, 150, 150)),
-        config=prior.PriorConfig,
-        section="prior",
         parts={"rest": Label("Standstill at the start", assumes="zero velocity at the start")},
     ),
-    "imu": Factor(
-        STREAMS["imu"].LABEL,
-        imu.build,
-        imu.ImuConfig,
-        "imu",
-        "imu",
-        {
-            "imu_bias": Label("IMU bias random walk", assumes="biases change slowly", colour=(200, 110, 70)),
-            "imu_gap_error": Label("Gap error model", assumes="error of the motion inside IMU data gaps"),
-        },
+    "imu": _of(
+        *("imu", imu.build, imu.ImuConfig),
+        imu_bias=Label("IMU bias random walk", assumes="biases change slowly", colour=(200, 110, 70)),
+        imu_gap_error=Label("Gap error model", assumes="error of the motion inside IMU data gaps"),
     ),
-    "gnss": Factor(
-        STREAMS["gnss"].LABEL,
-        gnss.build,
-        gnss.GnssConfig,
-        "gnss",
-        "gnss",
-        {
-            "gnss_correlated_error": Label(
-                "Correlated GNSS error (Gauss-Markov)", assumes="successive fixes have correlated errors"
-            )
-        },
+    "gnss": _of(
+        *("gnss", gnss.build, gnss.GnssConfig),
+        gnss_correlated_error=Label(
+            "Correlated GNSS error (Gauss-Markov)", assumes="successive fixes have correlated errors"
+        ),
     ),
-    "control": Factor(STREAMS["control"].LABEL, control.build, control.ControlConfig, "control", "control"),
-    "pose_fixes": Factor(
-        STREAMS["pose_fixes"].LABEL, pose_fix.build, pose_fix.PoseFixConfig, "pose_fixes", "pose_fixes"
-    ),
+    "control": _of("control", control.build, control.ControlConfig),
+    "pose_fixes": _of("pose_fixes", pose_fix.build, pose_fix.PoseFixConfig),
     "pose_attitude": Factor(
-        Label("Attitude of pose fixes"),
-        pose_fix.build_attitude,
-        pose_fix.PoseFixConfig,
-        "pose_fixes",
-        "pose_fixes",
+        *(pose_fix.build_attitude, pose_fix.PoseFixConfig, "pose_fixes"), Label("Attitude of pose fixes"), "pose_fixes"
     ),
-    "ranges": Factor(STREAMS["ranges"].LABEL, ranging.build, ranging.RangeConfig, "ranges", "ranges"),
-    "static": Factor(
-        STREAMS["static"].LABEL,
-        standstill.build,
-        StandstillConfig,
-        "standstill",
-        "static",
-        {
-            "static_turn": Label("Zero angular rate updates (ZARU)", assumes="zero angular rate while at rest"),
-            "static_level": Label("Flat floor", assumes="the floor is flat"),
-        },
+    "ranges": _of("ranges", ranging.build, ranging.RangeConfig),
+    "static": _of(
+        *("static", standstill.build, StandstillConfig, "standstill"),
+        static_turn=Label("Zero angular rate updates (ZARU)", assumes="zero angular rate while at rest"),
+        static_level=Label("Flat floor", assumes="the floor is flat"),
     ),
     "gnss_velocity": Factor(
-        Label("GNSS velocity"),
-        velocity.build_gnss,
-        velocity.VelocityConfig,
-        "velocity",
-        "gnss",
+        velocity.build_gnss, velocity.VelocityConfig, "velocity", Label("GNSS velocity"), stream="gnss"
     ),
-    "velocity": Factor(STREAMS["velocity"].LABEL, velocity.build, velocity.VelocityConfig, "velocity", "velocity"),
+    "velocity": _of("velocity", velocity.build, velocity.VelocityConfig),
     "vehicle": Factor(
+        *(vehicle.build, vehicle.VehicleConfig, "vehicle"),
         Label("Vehicle constraint", assumes="wheels move neither sideways nor off the road"),
-        vehicle.build,
-        vehicle.VehicleConfig,
-        "vehicle",
     ),
-    "wheel": Factor(STREAMS["wheel"].LABEL, wheel.build, wheel.WheelConfig, "wheel", "wheel"),
-    "magnetometer": Factor(
-        STREAMS["magnetometer"].LABEL,
-        magnetometer.build,
-        magnetometer.MagnetometerConfig,
-        "magnetometer",
-        "magnetometer",
-    ),
+    "wheel": _of("wheel", wheel.build, wheel.WheelConfig),
+    "magnetometer": _of("magnetometer", magnetometer.build, magnetometer.MagnetometerConfig),
     "gravity": Factor(
+        *(gravity.build, gravity.GravityConfig, "gravity"),
         Label("Gravity", assumes="the mean specific force is vertical"),
-        gravity.build,
-        gravity.GravityConfig,
-        "gravity",
         parts={"pace": Label("Walking pace", assumes="a pedestrian moves slowly")},
     ),
-    "barometer": Factor(
-        STREAMS["barometer"].LABEL,
-        barometer.build,
-        barometer.BarometerConfig,
-        "barometer",
-        "barometer",
-        {"barometer_bias": Label("Barometer bias random walk", assumes="the pressure offset changes slowly")},
+    "barometer": _of(
+        *("barometer", barometer.build, barometer.BarometerConfig),
+        barometer_bias=Label("Barometer bias random walk", assumes="the pressure offset changes slowly"),
     ),
     "steps": Factor(
+        *(pedestrian.build, pedestrian.StepConfig, "steps"),
         Label("Steps", assumes="length and direction of a pedestrian's steps"),
-        pedestrian.build,
-        pedestrian.StepConfig,
-        "steps",
     ),
     "image_pairs": Factor(
-        Label("Image pairs", colour=(225, 180, 20)),
-        coplanarity.build,
-        coplanarity.CoplanarityConfig,
-        "image_pairs",
-        "matches",
+        *(coplanarity.build, coplanarity.CoplanarityConfig, "image_pairs"),
+        *(Label("Image pairs", colour=(225, 180, 20)), "matches"),
     ),
-    "smart": Factor(
-        Label("Tracked points in space"),
-        smart.build,
-        smart.SmartConfig,
-        "smart",
-        "tracks",
-    ),
+    "smart": Factor(smart.build, smart.SmartConfig, "smart", Label("Tracked points in space"), "tracks"),
 }
 _PARTS = {part: name for name, factor in FACTORS.items() for part in factor.parts}
 _LABELS = {

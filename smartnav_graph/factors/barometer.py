@@ -23,7 +23,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
@@ -74,9 +74,7 @@ class Height:
     extra: tuple[str, ...] = ("D",)
     width = 3
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         height, later, weight = data[:, 0], data[:, 1], 1.0 / data[:, 2]
         residual = (p[:, 2] + v[:, 2] * later + extra[0][:, 0] - height) * weight

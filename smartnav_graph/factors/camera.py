@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -125,30 +124,17 @@ def seen_from(xy_n: Floats, turn: Floats) -> Floats:
     return np.asarray(ray[:, :2] / ray[:, 2:])
 
 
-class CameraOptions(Protocol):
-    """Options of a camera: prior sigmas deg and s (None: as calibrated), whether rows have their own time."""
-
-    @property
-    def boresight_sigma_deg(self) -> float | None: ...
-    @property
-    def time_offset_sigma(self) -> float | None: ...
-    @property
-    def row_time(self) -> bool: ...
-
-
-def make_camera_model(context: FactorContext, config: CameraOptions) -> CameraModel:
-    """The camera of a session, by the options of its image pairs."""
+def make_camera_model(
+    context: FactorContext, boresight_sigma_deg: float | None, time_offset_sigma: float | None, row_time: bool
+) -> CameraModel:
+    """The camera of a session; prior sigmas deg and s (None: as calibrated), whether rows have their own time."""
     camera = context.camera or UNKNOWN_CAMERA
     mount = context.session.mount(context.camera_name)
-    degrees = camera.boresight_sigma_deg if config.boresight_sigma_deg is None else config.boresight_sigma_deg
-    seconds = camera.time_offset_sigma_s if config.time_offset_sigma is None else config.time_offset_sigma
-    rig = Rig(
-        np.array(mount.body_R, dtype=np.float64),
-        np.array(mount.body_t, dtype=np.float64),
-        boresight=degrees > 0,
-        timed=seconds > 0,
-    )
-    readout = _readout_s(context) if config.row_time else 0.0
+    degrees = camera.boresight_sigma_deg if boresight_sigma_deg is None else boresight_sigma_deg
+    seconds = camera.time_offset_sigma_s if time_offset_sigma is None else time_offset_sigma
+    body_R, body_t = np.array(mount.body_R, dtype=np.float64), np.array(mount.body_t, dtype=np.float64)
+    rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0)
+    readout = _readout_s(context) if row_time else 0.0
     return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds)
 
 

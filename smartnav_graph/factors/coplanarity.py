@@ -70,6 +70,10 @@ class CoplanarityConfig:
         if not min(given) >= 0:
             raise ConfigError("config [image_pairs]", f"{self}", "parallax and sigmas >= 0")
 
+    def camera_model(self, context: FactorContext) -> CameraModel:
+        """The camera of a session with these options."""
+        return make_camera_model(context, self.boresight_sigma_deg, self.time_offset_sigma, self.row_time)
+
 
 # Why a pair is not used, in words.
 REASONS = (
@@ -315,7 +319,7 @@ def build(context: FactorContext) -> CoplanarityBuilder | None:
     pairs, config = context.pairs, context.options(CoplanarityConfig)
     if pairs is None or not len(pairs) or not config.enabled:
         return None
-    camera_model = make_camera_model(context, config)
+    camera_model = config.camera_model(context)
     return CoplanarityBuilder(
         pairs,
         context.image_ns,

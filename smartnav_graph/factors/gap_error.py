@@ -20,6 +20,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors.gap_model import Bridge
+from smartnav_graph.factors.gauss_markov import decay
 from smartnav_graph.factors.preintegration import InertialRow, Integrated, integrated
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
@@ -70,12 +71,7 @@ def _tie(before: int | None, name: int, rho: float, spread: Floats) -> gtsam.Non
     """G_j ~ N(rho G_i, spread), or zero mean at the border of the gap."""
     if before is None:
         return gtsam.PriorFactorVector(name, np.zeros(SIZE), gtsam.noiseModel.Gaussian.Covariance(spread))
-    root, unit = np.linalg.inv(np.linalg.cholesky(spread)), gtsam.noiseModel.Unit.Create(SIZE)
-    linear = gtsam.JacobianFactor(before, -rho * root, name, root, np.zeros(SIZE), unit)
-    origin = gtsam.Values()  # without a linearisation point GTSAM counts the factor as zero cost
-    origin.insert(before, np.zeros(SIZE))
-    origin.insert(name, np.zeros(SIZE))
-    return gtsam.LinearContainerFactor(linear, origin)
+    return decay(before, name, rho, np.linalg.inv(np.linalg.cholesky(spread)))
 
 
 def row(window: Window, ends: tuple[bool, bool], bias: Bias, covariance: Floats, gravity: float) -> FactorBatch:

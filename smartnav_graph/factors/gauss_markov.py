@@ -35,17 +35,14 @@ def add_correlated_error(update: GraphUpdate, window: Window, previous: State | 
         update.add(tag, gtsam.PriorFactorVector(name, np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
         return
     phi = float(np.exp(-window.length_s / noise.correlated_time))
-    driving = 1.0 / (sigma * np.sqrt(1.0 - phi**2))
-    before = key("C", window.index - 1)
-    linear = gtsam.JacobianFactor(
-        before,
-        np.diag(-phi * driving),
-        name,
-        np.diag(driving),
-        np.zeros(3),
-        gtsam.noiseModel.Unit.Create(3),
-    )
-    origin = gtsam.Values()  # without a linearisation point GTSAM counts the factor as zero cost
-    origin.insert(before, np.zeros(3))
-    origin.insert(name, np.zeros(3))
-    update.add(tag, gtsam.LinearContainerFactor(linear, origin))
+    root = np.diag(1.0 / (sigma * np.sqrt(1.0 - phi**2)))
+    update.add(tag, decay(key("C", window.index - 1), name, phi, root))
+
+
+def decay(before: int, after: int, phi: float, root: Floats) -> gtsam.NonlinearFactor:
+    """Factor root (c_after - phi c_before) = 0 of two vectors (n,); root (n, n) whitens."""
+    zero, origin = np.zeros(len(root)), gtsam.Values()
+    linear = gtsam.JacobianFactor(before, -phi * root, after, root, zero, gtsam.noiseModel.Unit.Create(len(root)))
+    for name in (before, after):  # without a linearisation point GTSAM counts the factor as zero cost
+        origin.insert(name, zero)
+    return gtsam.LinearContainerFactor(linear, origin)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 import gtsam
 import numpy as np
@@ -22,11 +21,11 @@ from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gauss_markov import add_correlated_error, correlated_sigma
-from smartnav_graph.factors.observation import PartialPreintegration, at_keyframe, preintegrated, row_model
+from smartnav_graph.factors.observation import Observed, PartialPreintegration, at_keyframe, preintegrated, row_model
 from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
-from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.session.stream import Positioned
@@ -71,9 +70,7 @@ class PositionFix:
     def __init__(self, extra: tuple[str, ...]) -> None:
         self.extra = extra
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         states = dict(zip(self.extra, extra, strict=True))
         lever = data[:, 3:6] + states.get("L", 0.0)
@@ -84,12 +81,6 @@ class PositionFix:
         by_state[:, :, 3:6] = np.eye(3) * weight
         by = {"C": np.eye(3) * weight, "L": R * weight}
         return residual, by_state, [by[letter] for letter in self.extra]
-
-
-@cache
-def position_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
-    """The one row model of each kind of fix; where : as in `observation.row_model`."""
-    return row_model(PositionFix(extra), timed=timed, where=where)
 
 
 def clock_state(sensor: str, sigma: float, initial: float = 0.0) -> SessionState:
@@ -266,11 +257,10 @@ class PositionBuilder(Builder):
                 self._add_native(update, row, noise_model(sigma, loss))
             return
         extra = ("C",) * chain + ("L",) * ("L" in states)
-        where = "keyframe" if index == update.index else "instant"
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = position_model(extra, "T" in states, where)
+        model = row_model(PositionFix, extra, timed="T" in states, here=index == update.index)
         keys = update.keys(model.letters, index, states)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

@@ -29,7 +29,7 @@ from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.magnetometer import turned_mean
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
@@ -66,9 +66,7 @@ class Upright:
     extra: tuple[str, ...] = ("B",)
     width = 4
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         (bias,) = extra
         force, weight = data[:, :3] - bias[:, :3], 1.0 / data[:, 3:4]

@@ -28,7 +28,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import exp, rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import SessionState, State, key
@@ -76,9 +76,7 @@ class SeenField:
     extra: tuple[str, ...] = ("H", "F")
     width = 15
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         iron, strength = extra
         y, A, north, weight = data[:, :3], data[:, 3:12].reshape(-1, 3, 3), data[:, 12:14], 1.0 / data[:, 14:15]

@@ -16,8 +16,9 @@ Source: Forster, Carlone, Dellaert, Scaramuzza (2017), On-manifold preintegratio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, Protocol
 
 import gtsam
@@ -29,6 +30,9 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.update import RowModel
 from smartnav_graph.graph.windows import Window
 
+# Whitened residual and its derivatives by state and by `extra`; see `Observation.observe`.
+Observed = tuple[Floats, Floats, list[Floats]]
+
 
 class Observation(Protocol):
     """One kind of measurement.
@@ -39,9 +43,7 @@ class Observation(Protocol):
     extra: tuple[str, ...]
     width: int
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """Whitened residual (m, d) and its derivatives.
 
         Parameters
@@ -204,11 +206,12 @@ class AtInstant:
         return residual, [*(by @ jacobian for jacobian in (*moved, *clock)), *by_extra]
 
 
-def row_model(observation: Observation, *, timed: bool = False, where: str = "keyframe") -> RowModel:
-    """The row model of an observation; where : at a ``keyframe``, or at an ``instant`` after one."""
-    if not timed and where == "keyframe":
-        return AtKeyframe(observation)
-    return AtInstant(observation, timed=timed, short=where == "keyframe")
+@cache
+def row_model(
+    kind: Callable[[tuple[str, ...]], Observation], extra: tuple[str, ...], *, timed: bool = False, here: bool = True
+) -> RowModel:
+    """The one row model of a kind of observation with some `extra` states; here : at the keyframe, not after it."""
+    return AtInstant(kind(extra), timed=timed, short=here) if timed or not here else AtKeyframe(kind(extra))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +24,10 @@ from smartnav_graph.core.so3 import exp, left_jacobian_inverse, log, right_jacob
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, clock_state
-from smartnav_graph.factors.observation import PartialPreintegration, at_keyframe, preintegrated, row_model
+from smartnav_graph.factors.observation import Observed, PartialPreintegration, at_keyframe, preintegrated, row_model
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import SessionState, State
-from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.session.session import Session
@@ -79,9 +78,7 @@ class AttitudeFix:
     def __init__(self, extra: tuple[str, ...]) -> None:
         self.extra = extra
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         fix, mount = data[:, :9].reshape(-1, 3, 3), data[:, 9:18].reshape(-1, 3, 3)
         weight = 1.0 / data[:, 18:21, None]
@@ -91,12 +88,6 @@ class AttitudeFix:
         by_state = np.zeros((len(R), 3, 9))
         by_state[:, :, :3] = by_turn @ R
         return theta * weight[:, :, 0], by_state, [by_turn @ predicted @ right_jacobian(x) for x in extra]
-
-
-@cache
-def attitude_model(extra: tuple[str, ...], timed: bool, where: str) -> RowModel:
-    """The one row model of each kind of row; where : as in `observation.row_model`."""
-    return row_model(AttitudeFix(extra), timed=timed, where=where)
 
 
 @dataclass
@@ -174,13 +165,12 @@ class AttitudeBuilder(Builder):
         index: int,
         partial: PartialPreintegration | None,
     ) -> None:
-        where = "keyframe" if index == update.index else "instant"
         sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else pass_state.scale(self.name))
         data = np.concatenate([self.attitude[row].ravel(), self.mount.ravel(), sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         used = not (pass_state.is_rejected(self.name, row) or pass_state.is_rejected(NAME, row))
-        model = attitude_model(("A",) * ("A" in states), "T" in states, where)
+        model = row_model(AttitudeFix, ("A",) * ("A" in states), timed="T" in states, here=index == update.index)
         keys, loss = update.keys(model.letters, index, states), self._loss(pass_state)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
@@ -72,9 +73,8 @@ class PriorBuilder(Builder):
         if window.kind != "first":
             if self.rest_end_ns is not None and window.t1_ns <= self.rest_end_ns:
                 still = gtsam.noiseModel.Isotropic.Sigma(3, REST_SPEED)
-                update.add(
-                    FactorId("rest", window.t1_ns), gtsam.PriorFactorVector(key("V", window.index), np.zeros(3), still)
-                )
+                zero = gtsam.PriorFactorVector(key("V", window.index), np.zeros(3), still)
+                update.add(FactorId("rest", window.t1_ns), zero)
             return
         update.predicted, update.bias = self.start.nav, self.start.bias
         tag = FactorId("prior", window.t1_ns)
@@ -84,25 +84,14 @@ class PriorBuilder(Builder):
         nav_R_body = attitude.matrix()
         rot = nav_R_body.T @ np.diag(self._sigma_rot(pass_state) ** 2) @ nav_R_body
         if self.sigma_pos is None:
-            model = gtsam.noiseModel.Gaussian.Covariance(rot)
-            update.add(tag, gtsam.PoseRotationPrior3D(x, attitude, model))
+            update.add(tag, gtsam.PoseRotationPrior3D(x, attitude, gtsam.noiseModel.Gaussian.Covariance(rot)))
         else:
-            cov = np.zeros((6, 6))
-            cov[:3, :3] = rot
-            cov[3:, 3:] = nav_R_body.T @ np.diag(self.sigma_pos**2) @ nav_R_body
-            update.add(
-                tag,
-                gtsam.PriorFactorPose3(
-                    x, gtsam.Pose3(attitude, pose.translation()), gtsam.noiseModel.Gaussian.Covariance(cov)
-                ),
-            )
-        update.add(
-            tag, gtsam.PriorFactorVector(v, self.velocity_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_vel))
-        )
-        update.add(
-            tag,
-            gtsam.PriorFactorConstantBias(b, self.bias_mean, gtsam.noiseModel.Diagonal.Sigmas(self.sigma_bias)),
-        )
+            place = nav_R_body.T @ np.diag(self.sigma_pos**2) @ nav_R_body
+            mean, model = gtsam.Pose3(attitude, pose.translation()), gtsam.noiseModel.Gaussian.Covariance
+            update.add(tag, gtsam.PriorFactorPose3(x, mean, model(block_diag(rot, place))))
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas
+        update.add(tag, gtsam.PriorFactorVector(v, self.velocity_mean, sigmas(self.sigma_vel)))
+        update.add(tag, gtsam.PriorFactorConstantBias(b, self.bias_mean, sigmas(self.sigma_bias)))
 
     def _sigma_rot(self, pass_state: PassState) -> Floats:
         if self.magnetic_stage is None or pass_state.stage < self.magnetic_stage or IRON in pass_state.fixed_states:

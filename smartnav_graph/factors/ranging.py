@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +21,11 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import PartialPreintegration, preintegrated, row_model
+from smartnav_graph.factors.observation import Observed, PartialPreintegration, preintegrated, row_model
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss
 from smartnav_graph.graph.states import SessionState, State
-from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate, RowModel
+from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
 from smartnav_graph.graph.windows import Window
 
 NAME = "ranges"
@@ -57,9 +56,7 @@ class AnchorRange:
     def __init__(self, extra: tuple[str, ...]) -> None:
         self.extra = extra
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         lever, weight = data[:, 3:6], 1.0 / data[:, 7:8]
         way = p + rotate(R, lever) - data[:, :3]
@@ -70,12 +67,6 @@ class AnchorRange:
         by_state[:, :, 3:6] = direction * weight[:, :, None]
         expected = distance + (extra[0] if extra else 0.0)
         return (expected - data[:, 6:7]) * weight, by_state, [weight[:, :, None] for _ in extra]
-
-
-@cache
-def range_model(extra: tuple[str, ...], where: str) -> RowModel:
-    """The one row model of each kind of range; where : as in `observation.row_model`."""
-    return row_model(AnchorRange(extra), where=where)
 
 
 @dataclass
@@ -157,7 +148,7 @@ class RangeBuilder(Builder):
         data = np.concatenate([self.anchor[row], self.lever, [self.distance[row], self.sigma[row]]])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = range_model(tuple(states), "keyframe" if partial is None else "instant")
+        model = row_model(AnchorRange, tuple(states), here=partial is None)
         keys, used = update.keys(model.letters, index, states), not pass_state.is_rejected(self.name, row)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

@@ -28,7 +28,7 @@ from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.factors.camera import BodyRates, CameraModel, make_camera_model
+from smartnav_graph.factors.camera import BodyRates, CameraModel
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.coplanarity import SMART, CoplanarityConfig
 from smartnav_graph.graph.keyframes import KeyframeConfig
@@ -184,7 +184,7 @@ def build(context: FactorContext) -> SmartBuilder | None:
         found = "enabled in a replay without its polish"
         expected = "a batch run or a polish: a track is settled once all of it was seen"
         raise ConfigError("config [smart]", found, expected, "leave replay.polish on, or smart off")
-    camera_model = make_camera_model(context, context.options(CoplanarityConfig))
+    camera_model = context.options(CoplanarityConfig).camera_model(context)
     return SmartBuilder(
         observations_of_tracks(tracks, pairs.t_ns, config.most_seen),
         context.image_ns,

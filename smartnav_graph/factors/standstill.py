@@ -24,7 +24,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
@@ -48,9 +48,7 @@ class Level:
     extra: tuple[str, ...] = ("U",)
     width = 1
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         (floor,) = extra
         weight = 1.0 / data[:, :1]

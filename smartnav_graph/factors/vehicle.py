@@ -27,7 +27,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import STATES, SessionState, State, key
@@ -131,9 +131,7 @@ class NonHolonomic:
         self.body_R_vehicle = body_R_vehicle
         self.extra: tuple[str, ...] = ("M", "G") if in_gap else ("M",)
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         mount, *gap_error = extra
         measured = data[:, :6].reshape(-1, 2, 3)

@@ -19,7 +19,7 @@ from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gnss import GnssConfig, clock_state
-from smartnav_graph.factors.observation import AtInstant, AtKeyframe, at_keyframe
+from smartnav_graph.factors.observation import AtInstant, AtKeyframe, Observed, at_keyframe
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
@@ -48,9 +48,7 @@ class NavVelocity:
     extra: tuple[str, ...] = ()
     width = 9
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         arm, weight = data[:, 3:6], 1.0 / data[:, 6:9]
         by_state = np.zeros((len(v), 3, 9))
@@ -65,9 +63,7 @@ class BodyVelocity:
     extra: tuple[str, ...] = ()
     width = 9
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         weight = 1.0 / data[:, 6:9]
         body_R_nav = R.transpose(0, 2, 1)

@@ -18,7 +18,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.observation import AtKeyframe
+from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.factors.vehicle import (
     RATE_S,
     DeclaredVelocity,
@@ -73,9 +73,7 @@ class RearWheels:
     def __init__(self, body_R_vehicle: Floats) -> None:
         self.body_R_vehicle = body_R_vehicle
 
-    def observe(
-        self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats
-    ) -> tuple[Floats, Floats, list[Floats]]:
+    def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
         """See `observation.Observation`."""
         mount, wheel = extra
         axes, declared = VehicleAxes.of(mount), DeclaredVelocity.of(R, v, self.body_R_vehicle)

@@ -134,7 +134,7 @@ class GraphUpdate:
         self.factors.append((tag, factor))
 
     def sensors(self) -> set[str]:
-        """Names of what touches this step."""
+        """Names of what touches this update."""
         return {tag.sensor for tag, _ in self.factors} | {block.sensor for block in self.blocks}
 
     def refreshed(self, bias: gtsam.imuBias.ConstantBias) -> bool:
@@ -146,11 +146,11 @@ class GraphUpdate:
         return True
 
     def names(self) -> list[int]:
-        """Keys of the states this step introduces."""
+        """Keys of the states this update introduces."""
         return [key(letter, self.index) for letter in KEYFRAME_LETTERS] + list(self.chain)
 
     def values(self) -> gtsam.Values:
-        """Initial values of the states this step introduces (gtsam.Values)."""
+        """Initial values of the states this update introduces (gtsam.Values)."""
         values = gtsam.Values()
         values.insert(key("X", self.index), self.predicted.pose())
         values.insert(key("V", self.index), self.predicted.velocity())

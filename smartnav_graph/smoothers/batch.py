@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 
 import gtsam
@@ -20,12 +21,11 @@ from smartnav_graph.smoothers.estimate import (
     chronological_order,
     copy_state,
     eliminated,
+    estimate_of,
     indeterminate,
     posterior,
     session_states,
-    session_values,
     state_at,
-    states_of,
     undetermined,
 )
 from smartnav_graph.smoothers.minimise import COARSE, Solve, SolveConfig, minimise
@@ -34,7 +34,7 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """settle_s : stretch after which the latest steps are solved by themselves, so that later windows start from an
+    """settle_s : stretch after which the latest updates are solved by themselves, so that later windows start from an
     anchored state; as the gyro bias becomes known it grows to longest_settle_s."""
 
     settle_s: float = 30.0
@@ -82,7 +82,7 @@ class Batch:
     t0_ns: int = 0
     coarse_start: bool = False
     first_s: float = 0.0
-    steps: list[GraphUpdate] = field(default_factory=list)
+    updates: list[GraphUpdate] = field(default_factory=list)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     _settled: int = 0
     _stretch_s: float = 0.0
@@ -97,13 +97,13 @@ class Batch:
 
     def latest(self) -> State | None:
         """Latest state: of the initial values, of the last solved segment, or predicted since then."""
-        if not self.steps:
+        if not self.updates:
             return None
-        return state_at(self.values, self.steps[-1].index, self.steps[-1].t_ns)
+        return state_at(self.values, self.updates[-1].index, self.updates[-1].t_ns)
 
     def update(self, update: GraphUpdate) -> None:
         """Take one update; solve the latest segment when it is long enough."""
-        self.steps.append(update)
+        self.updates.append(update)
         known = gtsam.Values() if self.initial_values is None else self.initial_values
         for name, state in update.session.items():
             if not self.values.exists(name):
@@ -115,7 +115,7 @@ class Batch:
         self.values.insert(new)
         self._recent.insert(new)
         self._share(update, self._recent)
-        since = update.t_s - self.steps[self._settled].t_s
+        since = update.t_s - self.updates[self._settled].t_s
         if since >= self._stretch_s:
             begin = time.perf_counter()
             self._settle(since)
@@ -133,7 +133,7 @@ class Batch:
         Where the first state is a guess its segment grows by doubling from the beginning: an unknown gyro bias turns a
         dead-reckoned guess away before there are enough fixes to stop it.
         """
-        stretch = self.steps[self._settled :]
+        stretch = self.updates[self._settled :]
         growing = self.coarse_start and self._settled == 0 and self._stretch_s < self.config.settle_s
         try:
             solve = self._solve_stretch(stretch, self._recent, since)
@@ -143,48 +143,46 @@ class Batch:
                 graph = self._stretch_graph(stretch, since)
                 tree = _eliminate(graph.linearize(solve.values), self._order(stretch))
                 self._anchor = _anchor(tree, solve.values, stretch[-1])
-                self._settled = len(self.steps) - 1
+                self._settled = len(self.updates) - 1
         except (RuntimeError, SolverError):
-            return  # not observable yet: a longer stretch is tried at the next step
+            return  # not observable yet: a longer stretch is tried at the next update
         self.values.update(solve.values)
         self._recent = solve.values
         if growing:
             self._stretch_s = min(2.0 * self._stretch_s, self.config.settle_s)
         else:
             self._recent = gtsam.Values()
-            copy_state(self.steps[-1], self.values, self._recent)
+            copy_state(self.updates[-1], self.values, self._recent)
             self._stretch_s = self._next_stretch(tree)
 
     def _next_stretch(self, tree: gtsam.GaussianBayesTree) -> float:
         """As long as the gyro bias is unlikely to turn the guess by more than `LARGEST_TURN`."""
-        bias = np.diag(tree.marginalCovariance(key("B", self.steps[-1].index)))[3:]
+        bias = np.diag(tree.marginalCovariance(key("B", self.updates[-1].index)))[3:]
         shortest, longest = SHORTEST_STRETCH * self.config.settle_s, self.config.longest_settle_s
         return float(np.clip(LARGEST_TURN / np.sqrt(bias.max()), shortest, longest))
 
     def _stretch_graph(self, stretch: Sequence[GraphUpdate], since: float) -> WholeGraph:
         """Factors of a stretch, held at its beginning."""
-        first = stretch[0] is self.steps[0]
+        first = stretch[0] is self.updates[0]
         graph = WholeGraph.of(stretch if first else stretch[1:])
         if not first:
             graph.native.push_back(self._anchor)
             return graph
-        graph.native.push_back(_place(self.steps[0]))
+        graph.native.push_back(_place(self.updates[0]))
         if since < HOLD_S:
-            graph.native.push_back(_hold(self.steps[0]))
+            graph.native.push_back(_hold(self.updates[0]))
         return graph
 
     def _order(self, stretch: Sequence[GraphUpdate]) -> gtsam.Ordering:
-        """Keyframes of a stretch, then the session states that its factors touch: not those of its first step, which
+        """Keyframes of a stretch, then the session states that its factors touch: not those of its first update, which
         the anchor replaces."""
-        order, touched = gtsam.Ordering(), stretch if stretch[0] is self.steps[0] else stretch[1:]
-        for name in [name for step in stretch for name in step.names()] + list(session_states(touched)):
-            order.push_back(name)
-        return order
+        touched = stretch if stretch[0] is self.updates[0] else stretch[1:]
+        return gtsam.Ordering([*(name for update in stretch for name in update.names()), *session_states(touched)])
 
     def _solve_stretch(self, stretch: Sequence[GraphUpdate], values: gtsam.Values, since: float) -> Solve:
         graph, order = self._stretch_graph(stretch, since), self._order(stretch)
         enough = 0.0 if self.coarse_start else GOOD_COST * len(stretch)
-        return minimise(graph, values, order, COARSE, lambda candidate: _reintegrated(stretch, candidate), enough)
+        return minimise(graph, values, order, COARSE, partial(_reintegrated, stretch), enough)
 
     def _lengthened(self, stretch: Sequence[GraphUpdate], since: float) -> Solve:
         """Solve a stretch from its beginning in doubling parts, each predicted from the part before."""
@@ -193,10 +191,10 @@ class Batch:
         while solve is None or size < len(stretch):
             size = min(2 * size, len(stretch))
             part = stretch[:size]
-            for step in part:
-                if not values.exists(key("X", step.index)):
-                    copy_state(step, self._recent, values)
-                    self._share(step, values)
+            for update in part:
+                if not values.exists(key("X", update.index)):
+                    copy_state(update, self._recent, values)
+                    self._share(update, values)
             known = 0 if solve is None else size // 2 - 1
             solve = self._solve_stretch(part, _reintegrated(part[known:], values), since)
             values = solve.values
@@ -204,11 +202,10 @@ class Batch:
 
     def _refresh(self, values: gtsam.Values) -> bool:
         """Preintegrate again where the bias has left its linearisation point; whether any window did."""
-        fresh = [step.refreshed(values.atConstantBias(key("B", before.index))) for before, step in pairwise(self.steps)]
+        fresh = [
+            update.refreshed(values.atConstantBias(key("B", before.index))) for before, update in pairwise(self.updates)
+        ]
         return any(fresh)
-
-    def _reintegrate(self, candidate: gtsam.Values) -> gtsam.Values:
-        return _reintegrated(self.steps, candidate)
 
     def estimate(self) -> Estimate:
         """Solve everything.
@@ -222,13 +219,13 @@ class Batch:
         try:
             graph, solve = self._solved(self.solve)
             solved = time.perf_counter()
-            marginals = posterior(eliminated(graph, solve.values, self.steps), self.steps)
-            covariance = marginals.nav(states_of(solve.values, [update.index for update in self.steps])[0])
+            marginals = posterior(eliminated(graph, solve.values, self.updates), self.updates)
+            estimate = estimate_of(self.updates, solve, marginals)
         except RuntimeError as error:
-            raise self._explain(error) from error
-        check_covariance(covariance, self.steps, self.t0_ns)
+            raise indeterminate(error, self.updates, self.t0_ns) from error
+        check_covariance(estimate.covariance, self.updates, self.t0_ns)
         seconds = {"solve": self._settle_s + solved - begin, "covariance": time.perf_counter() - solved}
-        return self._result(solve, covariance, marginals, seconds)
+        return replace(estimate, seconds=seconds)
 
     def provisional(self) -> Estimate:
         """Solve everything coarsely, without any covariance (zeros); errors as `estimate`."""
@@ -236,15 +233,15 @@ class Batch:
         try:
             _, solve = self._solved(COARSE)
         except RuntimeError as error:
-            raise self._explain(error) from error
+            raise indeterminate(error, self.updates, self.t0_ns) from error
         self._settle_s += time.perf_counter() - begin
-        none = np.zeros((len(self.steps), 15, 15))
-        blank = {name: np.zeros((len(state.initial),) * 2) for name, state in session_states(self.steps).items()}
-        return self._result(solve, none, Posterior(none, none[1:], blank), {})
+        none = np.zeros((len(self.updates), 15, 15))
+        blank = {name: np.zeros((len(state.initial),) * 2) for name, state in session_states(self.updates).items()}
+        return estimate_of(self.updates, solve, Posterior(none, none[1:], blank), none)
 
     def renewed(self, renew: Callable[[GraphUpdate], None]) -> None:
         """Change what the updates add; a session state that comes with it begins at its prior mean."""
-        for update in self.steps:
+        for update in self.updates:
             renew(update)
             for name, state in update.session.items():
                 if not self.values.exists(name):
@@ -252,35 +249,14 @@ class Batch:
 
     def _solved(self, precision: SolveConfig) -> tuple[WholeGraph, Solve]:
         """Everything solved from the present values, which then are the solution."""
-        order, reintegrate = chronological_order(self.steps), self._reintegrate if self.coarse_start else None
-        graph = WholeGraph.of(self.steps)
+        graph, order = WholeGraph.of(self.updates), chronological_order(self.updates)
+        reintegrate = partial(_reintegrated, self.updates) if self.coarse_start else None
         solve = minimise(graph, self.values, order, precision, reintegrate)
         if not self.coarse_start and self._refresh(solve.values):
-            graph = WholeGraph.of(self.steps)
+            graph = WholeGraph.of(self.updates)
             solve = minimise(graph, solve.values, order, precision)
         self.values = solve.values
         return graph, solve
-
-    def _result(self, solve: Solve, covariance: Floats, marginals: Posterior, seconds: dict[str, float]) -> Estimate:
-        return Estimate(
-            values=solve.values,
-            indices=[update.index for update in self.steps],
-            t_ns=np.array([update.t_ns for update in self.steps], dtype=np.int64),
-            covariance=covariance,
-            factors=[item for update in self.steps for item in update.factors],
-            blocks=[block for update in self.steps for block in update.blocks],
-            iterations=solve.iterations,
-            converged=solve.converged,
-            cost=solve.cost,
-            session=session_values(self.steps, solve.values, marginals),
-            marginals=marginals,
-            seconds=seconds,
-        )
-
-    def _explain(self, error: RuntimeError) -> SolverError:
-        t_ns = {update.index: update.t_ns for update in self.steps}
-        touching = {update.index: update.sensors() for update in self.steps}
-        return indeterminate(error, t_ns, self.t0_ns, touching)
 
 
 def _hold(update: GraphUpdate) -> gtsam.NonlinearFactor:
@@ -296,12 +272,12 @@ def _place(update: GraphUpdate) -> gtsam.NonlinearFactor:
     return gtsam.GPSFactor(key("X", update.index), update.predicted.position(), model)
 
 
-def _reintegrated(steps: Sequence[GraphUpdate], values: gtsam.Values) -> gtsam.Values:
+def _reintegrated(updates: Sequence[GraphUpdate], values: gtsam.Values) -> gtsam.Values:
     """The states predicted from the first one, all with its bias."""
-    state = state_at(values, steps[0].index, steps[0].t_ns)
+    state = state_at(values, updates[0].index, updates[0].t_ns)
     nav, bias = state.nav, state.bias
     reintegrated = gtsam.Values(values)
-    for update in steps[1:]:
+    for update in updates[1:]:
         if update.predict is None:
             return values
         nav = update.predict(nav, bias)
@@ -333,7 +309,7 @@ def _anchor(tree: gtsam.GaussianBayesTree, values: gtsam.Values, update: GraphUp
     return graph
 
 
-def check_covariance(covariance: Floats, steps: Sequence[GraphUpdate], t0_ns: int) -> None:
+def check_covariance(covariance: Floats, updates: Sequence[GraphUpdate], t0_ns: int) -> None:
     """Observability: every variance finite and positive, position known better than `LARGEST_VARIANCE`.
 
     Raises
@@ -348,5 +324,4 @@ def check_covariance(covariance: Floats, steps: Sequence[GraphUpdate], t0_ns: in
         | (variances[:, 3:6] > LARGEST_VARIANCE).any(axis=1)
     )
     if bad.any():
-        step = steps[int(np.flatnonzero(bad)[0])]
-        raise undetermined((step.t_ns - t0_ns) / 1e9, "position or attitude", step.index, step.sensors())
+        raise undetermined(updates[int(np.flatnonzero(bad)[0])], t0_ns)

@@ -16,6 +16,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.smoothers.minimise import Solve
 from smartnav_graph.smoothers.whole_graph import StackedFactors, WholeGraph, stacks_of
 
 Conditionals = Mapping[int, gtsam.GaussianConditional]
@@ -50,10 +51,6 @@ class Posterior:
     following: Floats
     session: Mapping[int, Floats]
 
-    def nav(self, nav_R_body: Floats) -> Floats:
-        """`joint` in nav axes."""
-        return to_nav_axes(self.joint, nav_R_body)
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -80,6 +77,11 @@ class Estimate:
     session: Mapping[str, SessionValue] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def held(self) -> Mapping[int, Floats]:
+        """Session states that are constants, by key."""
+        return {state.key: state.value for state in self.session.values() if state.held}
+
     def offset_s(self, sensor: str) -> float:
         """Time offset of a sensor, zero where it has none."""
         found = self.session.get(f"{sensor}_time_offset_s")
@@ -101,9 +103,8 @@ class Estimate:
 
     @cached_property
     def _stacks(self) -> Mapping[str, list[StackedFactors]]:
-        held = {state.key: state.value for state in self.session.values() if state.held}
         found: dict[str, list[StackedFactors]] = {}
-        for stack in stacks_of(self.blocks, held):
+        for stack in stacks_of(self.blocks, self.held):
             found.setdefault(stack.blocks[0].sensor, []).append(stack)
         return found
 
@@ -163,31 +164,22 @@ def state_distance(one: Sequence[Floats], other: Sequence[Floats]) -> tuple[floa
     return float(np.linalg.norm(pa - pb, axis=1).max()), float(np.degrees(angle.max()))
 
 
-def session_states(steps: Iterable[GraphUpdate]) -> dict[int, SessionState]:
+def session_states(updates: Iterable[GraphUpdate]) -> dict[int, SessionState]:
     """The free session states that updates touch, by key."""
-    found: dict[int, SessionState] = {}
-    for update in steps:
-        found |= update.session
-    return found
+    return {name: state for update in updates for name, state in update.session.items()}
 
 
-def chronological_order(steps: Sequence[GraphUpdate]) -> gtsam.Ordering:
+def chronological_order(updates: Sequence[GraphUpdate]) -> gtsam.Ordering:
     """Keyframes as they come, then what they all share: the cheapest elimination of a chain."""
-    order = gtsam.Ordering()
-    for update in steps:
-        for name in update.names():
-            order.push_back(name)
-    for name in session_states(steps):
-        order.push_back(name)
-    return order
+    return gtsam.Ordering([*(name for update in updates for name in update.names()), *session_states(updates)])
 
 
-def eliminated(graph: WholeGraph, values: gtsam.Values, steps: Sequence[GraphUpdate]) -> gtsam.GaussianBayesNet:
+def eliminated(graph: WholeGraph, values: gtsam.Values, updates: Sequence[GraphUpdate]) -> gtsam.GaussianBayesNet:
     """Bayes net of a graph linearised at `values`, in chronological order; QR is exact where states are weakly held."""
-    return graph.linearize(values).eliminateSequential(chronological_order(steps), gtsam.EliminateQR)
+    return graph.linearize(values).eliminateSequential(chronological_order(updates), gtsam.EliminateQR)
 
 
-def posterior(net: gtsam.GaussianBayesNet, steps: Sequence[GraphUpdate]) -> Posterior:
+def posterior(net: gtsam.GaussianBayesNet, updates: Sequence[GraphUpdate]) -> Posterior:
     """Marginals of a Bayes net eliminated in chronological order, session states last; see `joint_covariances`.
 
     Raises
@@ -195,11 +187,11 @@ def posterior(net: gtsam.GaussianBayesNet, steps: Sequence[GraphUpdate]) -> Post
     RuntimeError
         A keyframe is not determined.
     """
-    groups, session = [update.names() for update in steps], list(session_states(steps))
-    joint, following = np.empty((len(steps), 15, 15)), np.empty((max(len(steps) - 1, 0), 15, 15))
+    groups, session = [update.names() for update in updates], list(session_states(updates))
+    joint, following = np.empty((len(updates), 15, 15)), np.empty((max(len(updates) - 1, 0), 15, 15))
     later: dict[int, Floats] = {}
     for row, found in joint_covariances(net, groups, session):
-        if row == len(steps):
+        if row == len(updates):
             later = {name: found.of([name]) for name in session}
             continue
         joint[row] = found.covariance[:15, :15]
@@ -316,10 +308,12 @@ def _slices(names: Iterable[int]) -> dict[int, slice]:
     return at
 
 
-def session_values(steps: Sequence[GraphUpdate], values: gtsam.Values, marginals: Posterior) -> dict[str, SessionValue]:
+def session_values(
+    updates: Sequence[GraphUpdate], values: gtsam.Values, marginals: Posterior
+) -> dict[str, SessionValue]:
     """What was found of every session state, by name."""
     found = {}
-    for update in steps:
+    for update in updates:
         for name, state in update.session.items():
             if state.name not in found:
                 value, cov = values.atVector(name), marginals.session[name]
@@ -328,6 +322,28 @@ def session_values(steps: Sequence[GraphUpdate], values: gtsam.Values, marginals
             none, value = np.zeros((len(state.initial),) * 2), update.held[name]
             found[state.name] = SessionValue(state.name, name, value, none, state.initial, state.sigma, True)
     return found
+
+
+def estimate_of(
+    updates: Sequence[GraphUpdate], solve: Solve, marginals: Posterior, covariance: Floats | None = None
+) -> Estimate:
+    """The estimate of a solved graph; its covariance is that of `marginals` where none is given."""
+    indices = [update.index for update in updates]
+    if covariance is None:
+        covariance = to_nav_axes(marginals.joint, states_of(solve.values, indices)[0])
+    return Estimate(
+        values=solve.values,
+        indices=indices,
+        t_ns=np.array([update.t_ns for update in updates], dtype=np.int64),
+        covariance=covariance,
+        factors=[item for update in updates for item in update.factors],
+        blocks=[block for update in updates for block in update.blocks],
+        iterations=solve.iterations,
+        converged=solve.converged,
+        cost=solve.cost,
+        session=session_values(updates, solve.values, marginals),
+        marginals=marginals,
+    )
 
 
 def to_nav_axes(joint: Floats, nav_R_body: Floats) -> Floats:
@@ -343,25 +359,25 @@ _NEAR = re.compile(r"Symbol: (\w)(\d+)")
 _WHAT = {"X": "position or attitude", "V": "velocity", "B": "an inertial bias"}
 
 
-def indeterminate(
-    error: Exception, t_ns: Mapping[int, int], t0_ns: int, touching: Mapping[int, set[str]]
-) -> SolverError:
+def indeterminate(error: Exception, updates: Iterable[GraphUpdate], t0_ns: int) -> SolverError:
     """GTSAM's complaint about an under-determined state, in words: which, when, what touches it, what is missing."""
-    text = str(error)
+    text = str(error).strip()
     found = _NEAR.search(text)
     if found is None:
-        return SolverError("solve", text.strip().splitlines()[0] if text.strip() else "failed", "a solvable graph")
-    letter, index = found[1].upper(), int(found[2])
-    when = (t_ns[index] - t0_ns) / 1e9 if index in t_ns else float("nan")
-    return undetermined(when, _WHAT.get(letter, letter), index, touching.get(index, set()))
+        return SolverError("solve", text.splitlines()[0] if text else "failed", "a solvable graph")
+    what = _WHAT.get(found[1].upper(), found[1].upper())
+    update = next((update for update in updates if update.index == int(found[2])), None)
+    if update is None:
+        return SolverError("solve", f"{what} ({found[1]}{found[2]}) is not determined", "a measurement of it")
+    return undetermined(update, t0_ns, what)
 
 
-def undetermined(t_s: float, what: str, index: int, sensors: Iterable[str]) -> SolverError:
+def undetermined(update: GraphUpdate, t0_ns: int, what: str = _WHAT["X"]) -> SolverError:
     """The fault of a keyframe that nothing holds."""
-    names = ", ".join(sorted(sensors)) or "nothing"
+    names = ", ".join(sorted(update.sensors())) or "nothing"
     return SolverError(
-        f"t = {t_s:.2f} s",
-        f"{what} is not determined there (keyframe {index}, touched by {names})",
+        f"t = {(update.t_ns - t0_ns) / 1e9:.2f} s",
+        f"{what} is not determined there (keyframe {update.index}, touched by {names})",
         "an absolute measurement nearby",
         "add position fixes, control points or standstills, or give --initial",
     )

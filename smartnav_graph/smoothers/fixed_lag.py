@@ -107,9 +107,7 @@ class FixedLag(Incremental):
         last = leaving[-1].index
         factors, self._factors = _split(self._factors, last)
         blocks, self._blocks = _split(self._blocks, last)
-        order = gtsam.Ordering()
-        for name in (name for gone in leaving for name in gone.names()):
-            order.push_back(name)
+        order = gtsam.Ordering([name for gone in leaving for name in gone.names()])
         linear = WholeGraph(factors, blocks, self._held).linearize(self._live)
         _, rest = linear.eliminatePartialSequential(order, gtsam.EliminateQR)
         for i in range(rest.size()):
@@ -123,16 +121,9 @@ class FixedLag(Incremental):
 
     def _order(self) -> gtsam.Ordering:
         """Chronological, the latest keyframe last of all: its marginal is then the end of the elimination."""
-        latest = self._inside[-1]
-        own = _own(latest)
-        order = gtsam.Ordering()
-        for step in self._inside:
-            for name in step.names():
-                if name not in own:
-                    order.push_back(name)
-        for name in [*self._session, *own]:
-            order.push_back(name)
-        return order
+        own = _own(self._inside[-1])
+        names = [name for update in self._inside for name in update.names() if name not in own]
+        return gtsam.Ordering([*names, *self._session, *own])
 
     def _state(self, update: GraphUpdate) -> State:
         return state_at(self._live, update.index, update.t_ns)

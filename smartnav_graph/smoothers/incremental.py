@@ -18,12 +18,12 @@ from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.estimate import (
     Estimate,
     eliminated,
+    estimate_of,
     indeterminate,
     posterior,
-    session_values,
-    states_of,
     to_nav_axes,
 )
+from smartnav_graph.smoothers.minimise import Solve
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 
@@ -61,7 +61,7 @@ class Incremental(ABC):
 
     def __init__(self, config: ReplayConfig, t0_ns: int) -> None:
         self.config, self.t0_ns = config, t0_ns
-        self.steps: list[GraphUpdate] = []
+        self.updates: list[GraphUpdate] = []
         self.dropped: Counter[str] = Counter()
         self.effort = Effort()
         self._latest: State | None = None
@@ -89,8 +89,8 @@ class Incremental(ABC):
     def recent(self) -> tuple[NDArray[np.int64], Floats]:
         """Stamps (m,) and present positions (m, 3) of the keyframes of the last `lag_s`, in time order."""
         found = []
-        for update in reversed(self.steps):
-            if update.t_s < self.steps[-1].t_s - self.config.lag_s:
+        for update in reversed(self.updates):
+            if update.t_s < self.updates[-1].t_s - self.config.lag_s:
                 break
             found.append((update.t_ns, self._state(update).nav.position()))
         t_ns, position = zip(*reversed(found), strict=True)
@@ -107,16 +107,14 @@ class Incremental(ABC):
         try:
             self._take(update)
         except RuntimeError as error:
-            t_ns = {s.index: s.t_ns for s in [*self.steps, update]}
-            touching = {s.index: s.sensors() for s in [*self.steps, update]}
-            raise indeterminate(error, t_ns, self.t0_ns, touching) from error
-        self.steps.append(update)
+            raise indeterminate(error, [*self.updates, update], self.t0_ns) from error
+        self.updates.append(update)
         self._latest = None
 
     def latest(self) -> State | None:
         """State at the last keyframe with its covariance, after everything taken so far."""
-        if self._latest is None and self.steps:
-            state, joint = self._state(self.steps[-1]), self._marginal(self.steps[-1])
+        if self._latest is None and self.updates:
+            state, joint = self._state(self.updates[-1]), self._marginal(self.updates[-1])
             R = state.nav.attitude().matrix()
             self._latest = replace(state, covariance=to_nav_axes(joint[None], R[None])[0])
         return self._latest
@@ -124,24 +122,12 @@ class Incremental(ABC):
     def estimate(self, count: int | None = None) -> Estimate:
         """The first `count` keyframes (all by default) at `values`, with the covariance of their graph linearised
         there."""
-        steps = self.steps[:count]
-        if not steps:
+        updates = self.updates[:count]
+        if not updates:
             raise SolverError("replay", "no keyframe was processed", "at least one")
-        graph, values, indices = WholeGraph.of(steps), self.values(), [update.index for update in steps]
-        marginals = posterior(eliminated(graph, values, steps), steps)
-        return Estimate(
-            values=values,
-            indices=indices,
-            t_ns=np.array([update.t_ns for update in steps], dtype=np.int64),
-            covariance=marginals.nav(states_of(values, indices)[0]),
-            factors=[item for update in steps for item in update.factors],
-            blocks=[block for update in steps for block in update.blocks],
-            iterations=len(steps),
-            converged=True,
-            cost=graph.error(values),
-            session=session_values(steps, values, marginals),
-            marginals=marginals,
-        )
+        graph, values = WholeGraph.of(updates), self.values()
+        marginals = posterior(eliminated(graph, values, updates), updates)
+        return estimate_of(updates, Solve(values, graph.error(values), len(updates), converged=True), marginals)
 
 
 def scalars(state: SessionState, value: Floats, sigma: Floats) -> dict[str, tuple[float, float]]:

@@ -53,9 +53,7 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
         if factor is not None and not factor.empty():
             first = min(place.get(state, len(groups)) for state in factor.keys())  # noqa: SIM118
             factors.setdefault(first, []).append((name, factor))
-    order = gtsam.Ordering()
-    for state in [*(state for group in groups for state in group), *session]:
-        order.push_back(state)
+    order = gtsam.Ordering([*itertools.chain(*groups), *session])
     total = {name: np.zeros(3) for name in names}
     for row, joint in joint_covariances(linear.eliminateSequential(order, gtsam.EliminateQR), groups, session):
         _add_factors(total, factors.get(row, ()), joint)
@@ -80,13 +78,12 @@ def _add_factors(total: Mapping[str, Floats], factors: Sequence[tuple[str, Any]]
 
 def _linearized(estimate: Estimate) -> tuple[list[str], Any]:
     """The name of every factor in use, and the linear system (gtsam.GaussianFactorGraph) of them in that order."""
-    free = [state for state in estimate.session.values() if not state.held]
-    held = {state.key: state.value for state in estimate.session.values() if state.held}
     priors = [
         gtsam.PriorFactorVector(state.key, state.prior_mean, gtsam.noiseModel.Diagonal.Sigmas(state.prior_sigma))
-        for state in free
+        for state in estimate.session.values()
+        if not state.held
     ]
-    graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, held)
+    graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, estimate.held)
     names = [tag.sensor for tag, _ in estimate.factors] + [CALIBRATION] * len(priors)
     names += [stack.blocks[0].sensor for stack in graph.stacks for _ in range(int(stack.used.sum()))]
     return names, graph.linearize(estimate.values)

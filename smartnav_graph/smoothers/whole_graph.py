@@ -154,16 +154,13 @@ class WholeGraph:
         self._last: Snapshot | None = None
 
     @classmethod
-    def of(cls, steps: Sequence[GraphUpdate]) -> WholeGraph:
+    def of(cls, updates: Sequence[GraphUpdate]) -> WholeGraph:
         """Everything that updates add, with the priors of the session states they touch."""
-        session: dict[int, SessionState] = {}
-        held: dict[int, Floats] = {}
-        for update in steps:
-            session |= update.session
-            held |= update.held
-        priors = [session_prior(state) for state in session.values()]
-        factors = [factor for update in steps for _, factor in update.factors]
-        return cls([*factors, *priors], [block for update in steps for block in update.blocks], held)
+        session = {name: state for update in updates for name, state in update.session.items()}
+        held = {name: value for update in updates for name, value in update.held.items()}
+        factors = [factor for update in updates for _, factor in update.factors]
+        blocks = (block for update in updates for block in update.blocks)
+        return cls([*factors, *map(session_prior, session.values())], blocks, held)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """The linear system (gtsam.GaussianFactorGraph) at `values`."""

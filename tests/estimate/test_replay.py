@@ -28,8 +28,8 @@ def configured(smoother: str, **options) -> Config:
     return Config(replay=ReplayConfig(smoother=smoother, **options))
 
 
-def build_steps(problem):
-    """Steps of a problem, built once: preintegration depends on the bias it is made at."""
+def build_updates(problem):
+    """Updates of a problem, built once: preintegration depends on the bias it is made at."""
     initial = initialise(problem)
     maker = Batch(problem.config.batch, problem.config.solver, None, problem.session.t0_ns)
     for window in problem.windows:
@@ -38,18 +38,18 @@ def build_steps(problem):
         )
         update.refresh = None  # never again
         maker.update(update)
-    return maker.steps
+    return maker.updates
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_batch_and_converged_isam2_agree_on_the_same_steps(seed):
+def test_batch_and_converged_isam2_agree_on_the_same_updates(seed):
     problem = prepare(sn.simulate("figure-eight-60s", seed), Config())
-    steps = build_steps(problem)
+    updates = build_updates(problem)
     batch = Batch(problem.config.batch, SolveConfig(200, 1e-15, 1e-10), None, problem.session.t0_ns)
     causal = incremental(ReplayConfig("isam2", relinearize=1e-7), problem.session.t0_ns)
-    for step in steps:
-        batch.update(step)
-        causal.update(step)
+    for update in updates:
+        batch.update(update)
+        causal.update(update)
     for _ in range(10):
         causal._engine.update()  # nothing new: iSAM2 goes on relinearising
     one, other = batch.estimate(), causal.estimate()

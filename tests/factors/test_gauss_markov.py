@@ -34,13 +34,13 @@ def graph():
 
 
 def blocks(graph):
-    return [block for step in graph.steps for block in step.blocks]
+    return [block for update in graph.updates for block in update.blocks]
 
 
 def test_every_fix_is_a_row_of_a_block_and_every_keyframe_has_its_state(graph):
     assert len(blocks(graph)) == 30 and graph.factors("gnss") == []
     assert {block.sensor for block in blocks(graph)} == {"gnss"}
-    assert [list(step.chain) for step in graph.steps] == [[key("C", w.index)] for w in graph.windows]
+    assert [list(update.chain) for update in graph.updates] == [[key("C", w.index)] for w in graph.windows]
     assert len(graph.factors("gnss_correlated_error")) == len(graph.windows)
     assert len(graph.factors("control")) == 6  # surveyed points do not wander
 
@@ -68,12 +68,12 @@ def test_the_analytic_derivative_is_the_numerical_one(graph):
 
 
 def test_blocks_and_custom_factors_are_the_same_system(graph):
-    whole = WholeGraph.of(graph.steps)
+    whole = WholeGraph.of(graph.updates)
     one_by_one = gtsam.NonlinearFactorGraph()
-    for step in graph.steps:
-        for _, factor in step.factors:
+    for update in graph.updates:
+        for _, factor in update.factors:
             one_by_one.push_back(factor)
-        for block in step.blocks:
+        for block in update.blocks:
             one_by_one.push_back(custom_factor(block, 0, {}))
     assert whole.error(graph.values) == pytest.approx(one_by_one.error(graph.values), rel=1e-12)
     assert whole.error(graph.values) > 10.0

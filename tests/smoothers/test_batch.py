@@ -78,9 +78,9 @@ def test_warm_values_ten_kilometres_off(problem, prior):
 def test_without_anything_absolute_it_names_a_keyframe(problem, prior):
     """No prior, no fix: position and heading hang in the air."""
 
-    def only_inertial(step) -> None:
-        step.factors = [(tag, factor) for tag, factor in step.factors if tag.sensor.startswith("imu")]
-        step.blocks = []
+    def only_inertial(update) -> None:
+        update.factors = [(tag, factor) for tag, factor in update.factors if tag.sensor.startswith("imu")]
+        update.blocks = []
 
     batch = fill(problem, prior, Batch(t0_ns=problem.session.t0_ns), only_inertial)
     with pytest.raises(SolverError, match=r"t = \d+\.\d\d s: .* not determined there \(keyframe \d+, touched by") as e:
@@ -91,12 +91,12 @@ def test_without_anything_absolute_it_names_a_keyframe(problem, prior):
 @pytest.mark.parametrize("value", [np.nan, -1.0, np.inf, 1e19])
 def test_variances_that_cannot_be(problem, prior, value):
     batch = fill(problem, prior, Batch())
-    covariance = np.tile(np.eye(15), (len(batch.steps), 1, 1))
-    check_covariance(covariance, batch.steps, problem.session.t0_ns)
+    covariance = np.tile(np.eye(15), (len(batch.updates), 1, 1))
+    check_covariance(covariance, batch.updates, problem.session.t0_ns)
     covariance[5, 4, 4] = value
     with pytest.raises(SolverError, match=r"keyframe 5, touched by .*imu") as e:
-        check_covariance(covariance, batch.steps, problem.session.t0_ns)
-    seconds = (batch.steps[5].t_ns - problem.session.t0_ns) / 1e9
+        check_covariance(covariance, batch.updates, problem.session.t0_ns)
+    seconds = (batch.updates[5].t_ns - problem.session.t0_ns) / 1e9
     assert str(e.value).startswith(f"t = {seconds:.2f} s")
 
 
@@ -115,7 +115,7 @@ def test_the_prior_of_a_new_stretch_has_the_marginals_of_the_last_keyframe_times
         graph.push_back(factor)
     linear = graph.linearize(solved.values)
     tree, marginals = linear.eliminateMultifrontal(), gtsam.Marginals(graph, solved.values)
-    last = whole.steps[-1]
+    last = whole.updates[-1]
     for factor in map(batch._anchor(tree, solved.values, last).at, range(3)):
         (name,) = factor.keys()
         ratio = factor.noiseModel().covariance() / marginals.marginalCovariance(name)

@@ -14,7 +14,7 @@ from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.run import initialise
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, State, key
-from smartnav_graph.graph.update import GraphUpdate
+from smartnav_graph.graph.update import FactorId, GraphUpdate
 from smartnav_graph.smoothers import estimate as room
 from smartnav_graph.smoothers.whole_graph import custom_factor
 
@@ -138,7 +138,10 @@ def complaint() -> RuntimeError:
 
 
 def test_an_indeterminate_system_is_told_with_time_state_and_sensors():
-    error = room.indeterminate(complaint(), {21: 12_500_000_000}, 2_000_000_000, {21: {"imu", "gnss"}})
+    update = GraphUpdate(21, 12_500_000_000, 0.0)
+    for sensor in ("imu", "gnss"):
+        update.add(FactorId(sensor, update.t_ns), None)
+    error = room.indeterminate(complaint(), [update], 2_000_000_000)
     text = str(error)
     assert text.startswith("t = 10.50 s: position or attitude is not determined there")
     assert "keyframe 21, touched by gnss, imu" in text
@@ -147,18 +150,23 @@ def test_an_indeterminate_system_is_told_with_time_state_and_sensors():
 
 @pytest.mark.parametrize(("letter", "name"), [("v", "velocity"), ("b", "an inertial bias"), ("x", "position")])
 def test_the_state_is_named(letter, name):
-    error = room.indeterminate(RuntimeError(f"near variable\n 123 (Symbol: {letter}4)"), {4: 0}, 0, {})
+    error = room.indeterminate(RuntimeError(f"near variable\n 123 (Symbol: {letter}4)"), [GraphUpdate(4, 0, 0.0)], 0)
     assert name in str(error) and "touched by nothing" in str(error)
 
 
 def test_another_complaint_keeps_its_words():
-    assert "Something else" in str(room.indeterminate(RuntimeError("Something else\nat length"), {}, 0, {}))
+    assert "Something else" in str(room.indeterminate(RuntimeError("Something else\nat length"), [], 0))
+
+
+def test_a_state_of_the_session_is_named():
+    error = room.indeterminate(RuntimeError("near variable\n 123 (Symbol: t99)"), [GraphUpdate(4, 0, 0.0)], 0)
+    assert "T (t99) is not determined" in str(error)
 
 
 def test_the_order_names_every_state_once():
-    steps = [GraphUpdate(i, 0, 0.0) for i in range(11)]
-    steps[3].chain = {key("C", 3): np.zeros(3)}
-    order = room.chronological_order(steps)
+    updates = [GraphUpdate(i, 0, 0.0) for i in range(11)]
+    updates[3].chain = {key("C", 3): np.zeros(3)}
+    order = room.chronological_order(updates)
     names = [order.at(i) for i in range(order.size())]
     expected = [key(letter, i) for letter in KEYFRAME_LETTERS for i in range(11)] + [key("C", 3)]
     assert sorted(names) == sorted(expected)

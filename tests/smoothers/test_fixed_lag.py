@@ -43,36 +43,36 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def steps(problem):
+def updates(problem):
     """Steps built once, at the batch solution: preintegration and delays depend on the state they are made at."""
     prior = initialise(problem, 30.0).prior.with_position()
     solved, _, _ = solve_passes(problem, problem.windows, prior, ALL)
     smoother = Batch(initial_values=solved.values, t0_ns=problem.session.t0_ns)
     run_pass(smoother, problem.windows, [prior, *problem.builders], ALL)
-    for update in smoother.steps:
+    for update in smoother.updates:
         update.refresh = None  # never again
-    return smoother.steps
+    return smoother.updates
 
 
 @pytest.fixture(scope="module")
-def batch(problem, steps):
+def batch(problem, updates):
     smoother = Batch(solve=FINE, t0_ns=problem.session.t0_ns)
-    for update in steps:
+    for update in updates:
         smoother.update(update)
     return smoother.estimate()
 
 
-def replayed(steps, watch=lambda smoother: None, **options):
-    smoother = incremental(ReplayConfig("fixed-lag", **options), steps[0].t_ns)
-    for update in steps:
+def replayed(updates, watch=lambda smoother: None, **options):
+    smoother = incremental(ReplayConfig("fixed-lag", **options), updates[0].t_ns)
+    for update in updates:
         smoother.update(replace(update, blocks=list(update.blocks)))
         watch(smoother)
     return smoother
 
 
-def test_a_lag_longer_than_the_recording_is_batch(steps, batch):
+def test_a_lag_longer_than_the_recording_is_batch(updates, batch):
     """All states, clock offset and lever arm too, and every covariance."""
-    smoother = replayed(steps, lag_s=1e3, relinearize=1e-9)
+    smoother = replayed(updates, lag_s=1e3, relinearize=1e-9)
     estimate, now = smoother.estimate(), smoother.session_now()
     metres, degrees = largest_difference(estimate, batch)
     assert metres < 1e-5 and np.radians(degrees) < 1e-5
@@ -88,9 +88,9 @@ def test_a_lag_longer_than_the_recording_is_batch(steps, batch):
     np.testing.assert_allclose(estimate.covariance, batch.covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_isam2_with_session_states_converges_to_batch(steps, batch):
-    smoother = incremental(ReplayConfig("isam2", relinearize=1e-7, hold=False), steps[0].t_ns)
-    for update in steps:
+def test_isam2_with_session_states_converges_to_batch(updates, batch):
+    smoother = incremental(ReplayConfig("isam2", relinearize=1e-7, hold=False), updates[0].t_ns)
+    for update in updates:
         smoother.update(replace(update, blocks=list(update.blocks)))
     for _ in range(10):
         smoother._engine.update()  # nothing new: iSAM2 goes on relinearising
@@ -101,9 +101,9 @@ def test_isam2_with_session_states_converges_to_batch(steps, batch):
         np.testing.assert_allclose(state.value, batch.session[name].value, atol=1e-5)
 
 
-def test_session_states_converge_behind_a_short_lag(steps, batch):
+def test_session_states_converge_behind_a_short_lag(updates, batch):
     """What has left the lag has left its mark: within a tenth of a sigma of batch, as sure as batch."""
-    smoother = replayed(steps, lag_s=5.0)
+    smoother = replayed(updates, lag_s=5.0)
     estimate = smoother.estimate()
     clock, full = estimate.session["gnss_time_offset_s"], batch.session["gnss_time_offset_s"]
     assert clock.value[0] == pytest.approx(DELAY_S, abs=4 * full.sigma[0]) and full.sigma[0] < 0.01
@@ -118,35 +118,35 @@ def test_session_states_converge_behind_a_short_lag(steps, batch):
     np.testing.assert_allclose(sigma, expected, rtol=0.02)
 
 
-def test_a_session_state_is_inserted_once_and_the_window_stays_small(steps):
+def test_a_session_state_is_inserted_once_and_the_window_stays_small(updates):
     sizes, counts = [], []
 
     def watch(smoother) -> None:
         sizes.append(smoother._live.size())
         counts.append(len(smoother._factors) + len(smoother._blocks))
 
-    smoother = replayed(steps, watch, lag_s=5.0)
+    smoother = replayed(updates, watch, lag_s=5.0)
     unary = Counter(
         f.keys()[0] for _, f in smoother._factors if isinstance(f, gtsam.PriorFactorVector) and f.keys()[0] in (T, L)
     )
     assert unary == {T: 1, L: 1}
     half = len(sizes) // 2
     assert max(sizes[half:]) <= max(sizes[10:half]) + 3 and max(counts[half:]) <= max(counts[10:half]) + 4
-    assert smoother._left.size() == 3 * (len(steps) - len(smoother._inside))
+    assert smoother._left.size() == 3 * (len(updates) - len(smoother._inside))
     assert not smoother._left.exists(T) and smoother.values().exists(T)
 
 
-def test_marginalising_keeps_the_latest_covariance(steps):
+def test_marginalising_keeps_the_latest_covariance(updates):
     """To first order nothing is lost: with and without a lag, linearised near the same point."""
-    short, long = (replayed(steps[:25], lag_s=lag).latest() for lag in (4.0, 1e3))
+    short, long = (replayed(updates[:25], lag_s=lag).latest() for lag in (4.0, 1e3))
     scale = np.sqrt(np.outer(np.diag(long.covariance), np.diag(long.covariance)))
     assert np.abs((short.covariance - long.covariance) / scale).max() < 0.03
 
 
-def test_held_states_are_constants(problem, steps):
+def test_held_states_are_constants(problem, updates):
     held = {"gnss_time_offset_s": np.array([DELAY_S])}
     made = []
-    for update in steps[:20]:
+    for update in updates[:20]:
         copy = replace(update, blocks=list(update.blocks), session=dict(update.session), held={}, constants={})
         copy.hold(held)
         made.append(copy)
@@ -170,27 +170,27 @@ class Level:
 LEVEL = Level()
 
 
-def test_rows_of_keyframes_that_have_left_are_counted_and_left_out(steps):
+def test_rows_of_keyframes_that_have_left_are_counted_and_left_out(updates):
     """One block with rows of an old, an inner and the present keyframe: the old one alone is dropped."""
-    smoother = replayed(steps[:30], lag_s=5.0)
-    oldest, step = smoother._inside[0].index, steps[30]
+    smoother = replayed(updates[:30], lag_s=5.0)
+    oldest, update = smoother._inside[0].index, updates[30]
     rows = FactorBatch(
         "level", LEVEL, [(key("X", i),) for i in (3, oldest + 3, 30)], np.zeros((3, 1)), 0, rows=(7, 8, 9)
     )
-    smoother.update(replace(step, blocks=[*step.blocks, rows]))
+    smoother.update(replace(update, blocks=[*update.blocks, rows]))
     assert smoother.dropped == {"level": 1}
-    kept = smoother.steps[-1].blocks[-1]
+    kept = smoother.updates[-1].blocks[-1]
     assert kept.rows == (8, 9) and kept.data.shape == (2, 1)
     there = {(oldest_, block.rows) for oldest_, block in smoother._blocks if block.sensor == "level"}
     assert there == {(oldest + 3, (8,)), (30, (9,))}
-    for following in steps[31:40]:
+    for following in updates[31:40]:
         smoother.update(replace(following, blocks=list(following.blocks)))
     assert [b.rows for _, b in smoother._blocks if b.sensor == "level"] == []
 
 
-def test_isam2_holds_what_touches_every_step(steps):
-    smoother = incremental(ReplayConfig("isam2"), steps[0].t_ns)
-    for update in steps[:15]:
+def test_isam2_holds_what_touches_every_update(updates):
+    smoother = incremental(ReplayConfig("isam2"), updates[0].t_ns)
+    for update in updates[:15]:
         smoother.update(
             replace(update, blocks=list(update.blocks), session=dict(update.session), held={}, constants={})
         )
@@ -206,15 +206,15 @@ def test_a_step_that_is_no_number_names_its_state():
         fixed_lag._check(delta, [key("X", 3), key("V", 4)])
 
 
-def test_a_broken_measurement_is_told_with_its_time(steps):
-    smoother = replayed(steps[:5])
+def test_a_broken_measurement_is_told_with_its_time(updates):
+    smoother = replayed(updates[:5])
     bad = FactorBatch("level", LEVEL, [(key("X", 5),)], np.full((1, 1), np.nan), 0)
-    step = steps[5]
+    update = updates[5]
     with pytest.raises(SolverError, match=r"t = \d+\.\d\d s: .* not determined there \(keyframe \d, touched by"):
-        smoother.update(replace(step, blocks=[*step.blocks, bad]))
+        smoother.update(replace(update, blocks=[*update.blocks, bad]))
 
 
-def test_steps_are_built_on_what_is_known(problem):
+def test_updates_are_built_on_what_is_known(problem):
     """End to end: the loop's own order of latest, build, update."""
     prior = initialise(problem, 30.0).prior.with_position()
     smoother = incremental(ReplayConfig("fixed-lag", lag_s=8.0), problem.session.t0_ns)

@@ -61,7 +61,7 @@ def test_a_fixed_lag_keeps_its_lag_and_no_more(problem, prior):
         sizes.append(smoother._live.size())
 
     smoother = fill(problem, prior, incremental(ReplayConfig("fixed-lag", lag_s=10.0), problem.session.t0_ns), watch)
-    spacing = np.diff([update.t_s for update in smoother.steps]).min()
+    spacing = np.diff([update.t_s for update in smoother.updates]).min()
     most = (10.0 / spacing + 2) * len(KEYFRAME_LETTERS)
     assert max(sizes) <= most and len(smoother._inside) <= 10.0 / spacing + 2
     middle, last = sizes[len(sizes) // 2], sizes[-1]
@@ -74,8 +74,8 @@ def test_states_that_left_the_lag_keep_their_last_estimate(problem, prior):
     kept = {}
 
     def watch(smoother) -> None:
-        for step in smoother._inside:
-            kept[step.index] = smoother._live.atPose3(key("X", step.index)).translation()
+        for update in smoother._inside:
+            kept[update.index] = smoother._live.atPose3(key("X", update.index)).translation()
 
     smoother = fill(problem, prior, incremental(ReplayConfig("fixed-lag", lag_s=5.0), problem.session.t0_ns), watch)
     estimate = smoother.estimate()

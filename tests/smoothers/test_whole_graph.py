@@ -191,16 +191,16 @@ def test_blocks_are_joined_by_sensor_model_and_loss():
     assert [b.t_ns for b in found[0].blocks] == [0, 0] and isinstance(found[0], StackedFactors)
 
 
-def test_a_graph_of_steps_has_the_prior_of_each_session_state_once():
+def test_a_graph_of_updates_has_the_prior_of_each_session_state_once():
     rng = np.random.default_rng(4)
-    at, steps = values(rng), []
+    at, updates = values(rng), []
     for i in range(4):
         update = GraphUpdate(i, 0, 0.0)
         update.use(LEVER)
         update.blocks.append(block(rng, 4, keys=[keys(i)] * 4))
-        steps.append(update)
-    mine = WholeGraph.of(steps)
-    single = one_by_one([b for s in steps for b in s.blocks], {}, [session_prior(LEVER)])
+        updates.append(update)
+    mine = WholeGraph.of(updates)
+    single = one_by_one([b for u in updates for b in u.blocks], {}, [session_prior(LEVER)])
     np.testing.assert_allclose(
         information(mine.linearize(at), at)[0], information(single.linearize(at), at)[0], atol=1e-9
     )

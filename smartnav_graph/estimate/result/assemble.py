@@ -1,9 +1,10 @@
-"""Estimate -> Solution: nav axes, residuals by sensor, output rate, withheld rows scored."""
+"""A solved problem -> Solution: nav axes, residuals by sensor, output rate, withheld rows scored."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -15,8 +16,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate
 from smartnav_graph.core.timebase import NS, interpolate, ns_from_seconds
 from smartnav_graph.estimate.problem import TOO_LATE, Problem
-from smartnav_graph.estimate.result.solved import SolvedProblem
-from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.estimate.reweight.outliers import FixResiduals, fix_residuals, position_builders
 from smartnav_graph.estimate.reweight.track_outliers import whitened
 from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.factors.gnss import PositionBuilder
@@ -32,6 +32,24 @@ from smartnav_graph.smoothers.whole_graph import StackedFactors
 
 # Stamps (m,), sensor, whitened residuals (m, d), weight (m,), used (m,).
 Part = tuple[NDArray[np.int64], str, Floats, Floats, NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class SolvedProblem:
+    """The estimate of a problem and the pass state it was made with."""
+
+    problem: Problem
+    estimate: Estimate
+    pass_state: PassState
+
+    @cached_property
+    def fixes(self) -> Mapping[str, FixResiduals]:
+        """Residuals of each stream of positions at its keyframes, by sensor."""
+        windows = self.problem.windows
+        return {
+            builder.name: fix_residuals(builder, windows, self.estimate, self.pass_state)
+            for builder in position_builders(self.problem.builders)
+        }
 
 
 @dataclass(frozen=True)

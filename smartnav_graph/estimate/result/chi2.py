@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from smartnav_graph.estimate.result.solved import SolvedProblem
-from smartnav_graph.estimate.reweight import track_outliers
+from smartnav_graph.estimate.result.assemble import SolvedProblem
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
 from smartnav_graph.factors import builder_of
@@ -49,26 +49,23 @@ class Chi2:
     def per_dof(self) -> dict[str, float]:
         """``overall`` and every sensor that has redundancy; 1 is expected."""
         found = {"overall": 2.0 * self.cost / max(self.dof, 1.0)}
-        found |= {name: part.square / part.redundancy for name, part in self._sensors().items() if _enough(part)}
+        found |= {name: part.square / part.redundancy for name, part in self._sensors(enough=True)}
         return {name: round(value, 5) for name, value in found.items()}
 
     def reasons(self) -> dict[str, str]:
         """Why a sensor has no chi-square."""
         return {
             name: f"redundancy {abs(part.redundancy):.2f} of {part.residuals} residuals: the solution follows them"
-            for name, part in self._sensors().items()
-            if not _enough(part)
+            for name, part in self._sensors(enough=False)
         }
 
-    def _sensors(self) -> dict[str, SensorFit]:
-        return {name: part for name, part in self.parts.items() if name not in ("prior", CALIBRATION)}
+    def _sensors(self, *, enough: bool) -> Iterable[tuple[str, SensorFit]]:
+        for name, part in self.parts.items():
+            if name not in ("prior", CALIBRATION) and (part.redundancy >= LEAST_REDUNDANCY) == enough:
+                yield name, part
 
 
-def _enough(part: SensorFit) -> bool:
-    return part.redundancy >= LEAST_REDUNDANCY
-
-
-def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.TrackAccount | None) -> Chi2:
+def chi2_of(solved: SolvedProblem, solution: Solution, tracks: Account | None) -> Chi2:
     """Of a solved problem and the residuals of its keyframes."""
     parts: dict[str, SensorFit] = {}
     for name, found in redundancies(solved.estimate).items():
@@ -77,7 +74,7 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: track_outliers.Tr
             rows = solution.residuals.of(name) & solution.residuals.used
             count, square = int(rows.sum()), float((solution.residuals.whitened[rows] ** 2).sum())
         if name == SMART and tracks is not None:
-            count -= POINT_DOF * tracks.points
+            count -= POINT_DOF * tracks.used
         before = parts.get(builder_of(name), SensorFit())
         parts[builder_of(name)] = SensorFit(
             residuals=before.residuals + count,

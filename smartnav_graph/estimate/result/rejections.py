@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from smartnav_graph.estimate.problem import Problem
-from smartnav_graph.estimate.result.solved import SolvedProblem
+from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.smoothers.estimate import Estimate
 
 Rejection = Mapping[str, Any]

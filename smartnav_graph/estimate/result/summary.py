@@ -14,16 +14,15 @@ import numpy as np
 
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.problem import Problem
-from smartnav_graph.estimate.result.assemble import Withheld, used_counts
+from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld, used_counts
 from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
-from smartnav_graph.estimate.result.solved import SolvedProblem
-from smartnav_graph.estimate.reweight import track_outliers
-from smartnav_graph.estimate.reweight.image_pair_outliers import PairAccount, pair_account
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.estimate.reweight.track_outliers import track_account
 from smartnav_graph.estimate.reweight.update import OBSERVED
-from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS, SMART
+from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.solution import POS, Solution
@@ -80,13 +79,11 @@ def summarise(
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     duration = float(keyframes.seconds[-1] - keyframes.seconds[0])
     used = used_counts(problem, pass_state)
-    seen, tracks = (
-        pair_account(problem.builders, pass_state),
-        track_outliers.track_account(problem.builders, pass_state),
-    )
+    seen = pair_account(problem.builders, pass_state)
+    tracks = track_account(problem.builders, pass_state)
     fit = chi2_of(solved, keyframes, tracks)
     chi2 = fit.per_dof()
-    images = (seen is not None and seen.pairs[REASONS[IN_USE]] > 0) or (tracks is not None and tracks.in_force)
+    images = (seen is not None and seen.used > 0) or (tracks is not None and tracks.in_force)
     mode = "batch" if used else "visual-inertial odometry" if images else "dead-reckoning"
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
@@ -115,8 +112,8 @@ def summarise(
         "dropped": {name: dict(counts) for name, counts in problem.dropped.items()},
         "used": dict(used),
         "rejected": _rejected(pass_state, seen, tracks),
-        **({} if seen is None else {"image_pairs": dict(seen.pairs)}),
-        **({} if tracks is None else {"tracks": dict(tracks.tracks)}),
+        **({} if seen is None else {"image_pairs": dict(seen.reasons)}),
+        **({} if tracks is None else {"tracks": dict(tracks.reasons)}),
         "rejections": rejections(solved),
         "withheld": {name: rows.to_dict() for name, rows in withheld.items()},
         "position_sigma_m": _sigma_summary(keyframes),
@@ -154,14 +151,12 @@ def _gaps(problem: Problem) -> list[dict[str, Any]]:
     ]
 
 
-def _rejected(
-    pass_state: PassState, seen: PairAccount | None, tracks: track_outliers.TrackAccount | None
-) -> dict[str, int]:
+def _rejected(pass_state: PassState, seen: Account | None, tracks: Account | None) -> dict[str, int]:
     """Rows rejected as outliers, by sensor; image pairs and tracks that contradict the trajectory, and matches and
     observations of those that do not."""
     found = {name: len(rows) for name, rows in pass_state.rejected.items() if name not in ("image_pairs", "matches")}
     if seen is not None:
-        found |= {"image_pairs": seen.pairs[REASONS[CONTRARY]], "matches": seen.outliers}
+        found |= {"image_pairs": seen.contrary, "matches": seen.outliers}
     if tracks is not None and tracks.in_force:
         found |= {SMART: tracks.contrary, "tracks": tracks.outliers}
     return found
@@ -175,56 +170,35 @@ def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
         sigma = state.prior_sigma if state.held else state.sigma
         value, spread = ([round(float(x), 6) for x in numbers] for numbers in (state.value, sigma))
         alone = len(value) == 1
-        found[state.name] = {
-            "value": value[0] if alone else value,
-            "sigma": spread[0] if alone else spread,
-            "held": state.held,
-        }
+        pair = (value[0], spread[0]) if alone else (value, spread)
+        found[state.name] = _state(*pair, held=state.held)
         if not alone and not state.held:
             found[state.name]["observed"] = (state.sigma < OBSERVED * state.prior_sigma).tolist()
-    found |= _inertial_noise(problem, pass_state) | _row_noise(problem, pass_state)
+    found |= _noise(problem, pass_state)
     for builder in position_builders(problem.builders):
         if builder.name in pass_state.correlated:
-            found[f"{builder.name}_correlated_sigma_m"] = {
-                "value": [float(s) for s in correlated_sigma(builder.noise)],
-                "sigma": None,
-                "held": True,
-            }
+            value = correlated_sigma(builder.noise).tolist()
+            found[f"{builder.name}_correlated_sigma_m"] = _state(value, held=True)
         if builder.name in pass_state.noise_scales:
             sigma = builder.scaled_sigma(pass_state)[~builder.own_sigma]
-            found[f"{builder.name}_sigma_m"] = {
-                "value": [round(float(s), 4) for s in sigma[0]],
-                "sigma": None,
-                "held": False,
-            }
+            found[f"{builder.name}_sigma_m"] = _state([round(float(s), 4) for s in sigma[0]])
     return found
 
 
-def _inertial_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
-    """Noise densities and bias walks used; held where the data said too little of them."""
+def _state(value: object, sigma: object = None, *, held: bool = False) -> dict[str, Any]:
+    return {"value": value, "sigma": sigma, "held": held}
+
+
+def _noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
+    """Noise densities, bias walks and sigmas of the constraints; held where the data said too little of them."""
     noise = problem.calibration.imu_noise
-    if not problem.config.imu.estimate_noise:
-        return {}
+    inertial = NOISE_NAMES if problem.config.imu.estimate_noise else {}
+    used = [(name, group, getattr(noise, name)) for group, name in inertial.items()]
+    for builder in problem.builders:
+        used += [(f"{group}_sigma", group, sigma) for group, sigma in builder.noise_groups.items()]
     return {
-        name: {
-            "value": float(f"{getattr(noise, name) * pass_state.scale(group):.4g}"),
-            "sigma": None,
-            "held": group not in pass_state.noise_scales,
-        }
-        for group, name in NOISE_NAMES.items()
-    }
-
-
-def _row_noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
-    """Sigmas of the constraints' rows."""
-    groups = [item for builder in problem.builders for item in builder.noise_groups.items()]
-    return {
-        f"{group}_sigma": {
-            "value": float(f"{sigma * pass_state.scale(group):.4g}"),
-            "sigma": None,
-            "held": group not in pass_state.noise_scales,
-        }
-        for group, sigma in groups
+        name: _state(float(f"{sigma * pass_state.scale(group):.4g}"), held=group not in pass_state.noise_scales)
+        for name, group, sigma in used
     }
 
 

@@ -7,8 +7,9 @@ test them, and none is used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +49,6 @@ def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: Pas
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or pass_state.tests(builder.name) >= COMPRESSED:
         return pass_state
-    return _tested(builder, estimate, pass_state)
-
-
-def _tested(builder: CoplanarityBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
     tests, scale = pass_state.tests(builder.name), pass_state.scale(builder.name)
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, _, v, bias = (x[place] for x in estimate.states())
@@ -116,27 +113,40 @@ def _by_states(
 
 
 @dataclass(frozen=True)
-class PairAccount:
-    """What became of the pairs (by reason, `REASONS`) and of the matches of those in use."""
+class Account:
+    """What became of image pairs or tracks (by reason, as in `REASONS`): of how many matches or observations of those
+    in use were outliers, why none is used, and whether they are in force."""
 
-    pairs: Mapping[str, int]
-    matches: int
+    reasons: Mapping[str, int]
     outliers: int
     refused: str
+    in_force: bool = True
+
+    @classmethod
+    def of(cls, verdict: NDArray[np.intp], reasons: Sequence[str], *rest: Any) -> Account:
+        """With the verdicts (n,), places in `reasons`, counted."""
+        count = np.bincount(verdict, minlength=len(reasons))
+        return cls(dict(zip(reasons, count.tolist(), strict=True)), *rest)
+
+    @property
+    def used(self) -> int:
+        """Pairs or tracks in use."""
+        return self.reasons[REASONS[IN_USE]]
+
+    @property
+    def contrary(self) -> int:
+        """Pairs or tracks that contradict the trajectory."""
+        return self.reasons[REASONS[CONTRARY]]
 
 
-def pair_account(builders: Iterable[Builder], pass_state: PassState) -> PairAccount | None:
+def pair_account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
     """The account of the image pairs of a run; None where there are none, or tracks replace them."""
     builder = one_of(builders, CoplanarityBuilder)
     if builder is None or builder.replaced(pass_state):
         return None
     selection = builder.selection(pass_state)
-    verdict = selection.verdict
-    count = np.bincount(verdict, minlength=len(REASONS))
-    inside = verdict[builder.seen.pair] == IN_USE
-    use = builder.used_matches(pass_state)
-    by_reason = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    return PairAccount(by_reason, int(inside.sum()), int((inside & ~use).sum()), selection.refused)
+    wrong = (selection.verdict[builder.seen.pair] == IN_USE) & ~builder.used_matches(pass_state)
+    return Account.of(selection.verdict, REASONS, int(wrong.sum()), selection.refused)
 
 
 def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estimate: Estimate) -> tuple[Relative, Mask]:

@@ -7,8 +7,8 @@ and the pairs stay.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.so3 import exp
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.factors.camera import BORESIGHT, STREAM
 from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.smart import (
@@ -165,28 +166,7 @@ def whitened(
     return builder.image_ns[seen.image[tested]], points.residual[tested] / sigma, selection.use[tested]
 
 
-@dataclass(frozen=True)
-class TrackAccount:
-    """What became of the tracks (by reason, `REASONS`) and of the observations of those in use."""
-
-    tracks: Mapping[str, int]
-    observations: int
-    outliers: int
-    refused: str
-    in_force: bool
-
-    @property
-    def contrary(self) -> int:
-        """Tracks that contradict the trajectory."""
-        return self.tracks[REASONS[CONTRARY]]
-
-    @property
-    def points(self) -> int:
-        """Tracks in use."""
-        return self.tracks[REASONS[IN_USE]]
-
-
-def track_account(builders: Iterable[Builder], pass_state: PassState) -> TrackAccount | None:
+def track_account(builders: Iterable[Builder], pass_state: PassState) -> Account | None:
     """The account of the tracks of a run; None where they are not asked for."""
     builder, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
     if builder is None:
@@ -194,9 +174,6 @@ def track_account(builders: Iterable[Builder], pass_state: PassState) -> TrackAc
     selection, refused = builder.selection(pass_state), ""
     if pairs is not None and pairs.selection(pass_state).refused:
         refused = "smart: tracks are refused as the image pairs are"
-    count = np.bincount(selection.verdict, minlength=len(REASONS))
-    by_reason = {reason: int(n) for reason, n in zip(REASONS, count, strict=True)}
-    inside = builder.sightings.there & (selection.verdict == IN_USE)[:, None]
-    wrong = int((inside & ~selection.use).sum())
+    wrong = builder.sightings.there & (selection.verdict == IN_USE)[:, None] & ~selection.use
     refused = selection.refused or refused
-    return TrackAccount(by_reason, int(inside.sum()), wrong, refused, builder.in_force(pass_state))
+    return Account.of(selection.verdict, REASONS, int(wrong.sum()), refused, builder.in_force(pass_state))
