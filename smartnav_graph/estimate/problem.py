@@ -63,12 +63,9 @@ class Problem:
         """Whether the first keyframe lies in a rest that has standstill factors of its own."""
         options, rests = self.config.standstill, self.rests
         at = self.windows[0].t1_ns
-        return (
-            rests is not None
-            and options.zupt
-            and options.zaru
-            and bool(np.isfinite(rests.over(rests.turn_sigma, at, at)))
-        )
+        if rests is None or not (options.zupt and options.zaru):
+            return False
+        return bool(np.isfinite(rests.over(rests.turn_sigma, at, at)))
 
 
 def prepare(session: Session, config: Config, *, causal: bool = False) -> Problem:

@@ -247,7 +247,10 @@ class PositionBuilder(Builder):
         sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else pass_state.scale(self.name))
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
-        loss = self._loss_of(row, sigma, update, pass_state) if index == update.index else self._loss_late(pass_state)
+        if index == update.index:
+            loss = self._loss_of(row, sigma, update, pass_state)
+        else:  # a late fix in replay: no prediction of its own time is at hand to gate it with
+            loss = "none" if self.config.loss == "none" else "huber"
         if pass_state.narrowing and loss == "cauchy":
             sigma = np.maximum(sigma, pass_state.robust_floor_m)
         sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
@@ -268,16 +271,11 @@ class PositionBuilder(Builder):
         """Sigma (3,) and loss of a row as they are used."""
         return sigma, loss
 
-    def _loss_late(self, pass_state: PassState) -> str:
-        """Loss of a late fix in replay: no prediction of its own time is at hand to gate it with."""
-        return "none" if self.config.loss == "none" else "huber"
-
     def _add_native(self, update: GraphUpdate, row: int, model: gtsam.noiseModel.Base) -> None:
         pose, tag = key("X", update.index), FactorId(self.name, update.t_ns, row)
-        if self.lever[row].any():
-            update.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever[row], model))
-        else:
-            update.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
+        arm = [self.lever[row]] if self.lever[row].any() else []
+        factor = gtsam.GPSFactorArm if arm else gtsam.GPSFactor
+        update.add(tag, factor(pose, self.position[row], *arm, model))
 
 
 def build(context: FactorContext) -> PositionBuilder | None:

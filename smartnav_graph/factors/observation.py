@@ -95,19 +95,8 @@ class PartialPreintegration(NamedTuple):
     def columns(self, offset: float = 0.0) -> Floats:
         """The data columns that `AtInstant` appends to an observation's own; `offset` s is the nominal time offset
         already contained in the instant."""
-        return np.concatenate(
-            [
-                [self.dt],
-                self.dR.ravel(),
-                self.dp,
-                self.dv,
-                self.by_bias.ravel(),
-                self.bias,
-                self.accel,
-                self.gyro,
-                [self.gravity, offset],
-            ]
-        )
+        *numbers, gravity = (np.ravel(part) for part in self)
+        return np.concatenate([*numbers, gravity, [offset]])
 
 
 _AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 54, "bias": 6, "accel": 3, "gyro": 3, "gravity": 1, "offset": 1}

@@ -127,21 +127,11 @@ def make_windows(
     kinds = _kinds(times, gaps, standstills)
     rows = _rows_by_keyframe(times, aiding, int(config.merge_s * NS))
 
-    windows = [Window(0, int(times[0]), int(times[0]), "first", dt[:0], means[:0, :3], means[:0, 3:], rows.get(0, {}))]
-    for k in range(1, len(times)):
-        part = slice(cut[k - 1], cut[k])
-        windows.append(
-            Window(
-                k,
-                int(times[k - 1]),
-                int(times[k]),
-                kinds[k - 1],
-                dt[part],
-                means[part, :3],
-                means[part, 3:],
-                rows.get(k, {}),
-            )
-        )
+    windows = []
+    for k, kind in enumerate(["first", *kinds]):
+        before = max(k - 1, 0)
+        span, part = (int(times[before]), int(times[k])), slice(cut[before], cut[k])
+        windows.append(Window(k, *span, kind, dt[part], means[part, :3], means[part, 3:], rows.get(k, {})))
     return windows
 
 

@@ -37,7 +37,7 @@ def first_stretch(problem: Problem, longest_s: float | None = None) -> FirstStre
         windows=problem.windows,
         imu=session.require_imu(),
         fixes=fixes if causal else replace(fixes, available_ns=fixes.t_ns),
-        fix_sigma=max((float(np.median(b.sigma[b.typical])) for b in position_builders(problem.builders)), default=1.0),
+        fix_sigma=_fix_sigma(problem, 3),
         gravity=session.gravity,
         noise=problem.calibration.imu_noise,
         forward=session.device.forward,
@@ -51,6 +51,12 @@ def first_stretch(problem: Problem, longest_s: float | None = None) -> FirstStre
         user=UserStart.parse(problem.config.run.initial) if problem.config.run.initial else None,
         **_north(problem, causal=causal),
     )
+
+
+def _fix_sigma(problem: Problem, axes: int) -> float:
+    """Typical sigma (m) of the worst stream of positions, over its first `axes`."""
+    builders = position_builders(problem.builders)
+    return max((float(np.median(b.sigma[b.typical, :axes])) for b in builders), default=1.0)
 
 
 def _standing(problem: Problem, shortest_s: float) -> int | None:
@@ -74,7 +80,7 @@ def _walked(problem: Problem, fixes: Fixes, causal_s: float | None) -> Walk | No
         [window for window in problem.windows if window.t1_ns <= end],
         steps.steps,
         (fixes.t_ns[used], fixes.position[used]),
-        max((float(np.median(b.sigma[b.typical, :2])) for b in position_builders(problem.builders)), default=1.0),
+        _fix_sigma(problem, 2),
         noise.imu_noise.gyro_bias_sigma,
         steps.model.body_R_vehicle,
         noise.step_noise,

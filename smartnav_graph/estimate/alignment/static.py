@@ -57,9 +57,7 @@ def find_rest(imu: Imu, start_ns: int, gravity: float, shortest_s: float, longes
         last = int(j)
     if last == 0 or t[last - 1] < shortest_s:
         return None
-    scatter = float(gyro[:last].std(axis=0).max())
-    sigma = max(scatter / np.sqrt(last), LEAST_RATE_SIGMA)
-    return Rest(accel[:last].mean(axis=0), gyro[:last].mean(axis=0), sigma, float(t[last - 1]))
+    return _rest(accel[:last], gyro[:last], float(t[last - 1]))
 
 
 def rest_over(imu: Imu, start_ns: int, end_ns: int, gravity: float) -> Rest | None:
@@ -69,8 +67,12 @@ def rest_over(imu: Imu, start_ns: int, end_ns: int, gravity: float) -> Rest | No
     accel, gyro = imu.accel[inside], imu.gyro[inside]
     if len(accel) < 4 or abs(np.linalg.norm(accel.mean(axis=0)) - gravity) > LEVEL:
         return None
+    return _rest(accel, gyro, (end_ns - start_ns) / NS)
+
+
+def _rest(accel: Floats, gyro: Floats, length_s: float) -> Rest:
     sigma = max(float(gyro.std(axis=0).max()) / np.sqrt(len(gyro)), LEAST_RATE_SIGMA)
-    return Rest(accel.mean(axis=0), gyro.mean(axis=0), sigma, (end_ns - start_ns) / NS)
+    return Rest(accel.mean(axis=0), gyro.mean(axis=0), sigma, length_s)
 
 
 def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> tuple[Floats, Floats, Floats]:
@@ -82,9 +84,9 @@ def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> 
     ----------
     curve : (n, 3) doubly integrated specific force in the first body frame; fixes : (n, 3) nav m; t : (n,) s, n >= 4
     """
-    fall = np.zeros_like(fixes)
+    fall, design = np.zeros_like(fixes), np.stack([np.ones_like(t), t], axis=-1)
     fall[:, 2] = -0.5 * gravity * t**2
-    basis, _ = np.linalg.qr(np.stack([np.ones_like(t), t], axis=-1))
+    basis, _ = np.linalg.qr(design)
     target, source = fixes - fall, curve
 
     def project(rows: Floats) -> Floats:
@@ -92,8 +94,8 @@ def kabsch_attitude(curve: Floats, fixes: Floats, t: Floats, gravity: float) -> 
 
     u, _, vt = np.linalg.svd(project(target).T @ project(source))
     R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    line = np.linalg.lstsq(np.stack([np.ones_like(t), t], axis=-1), target - source @ R.T, rcond=None)[0]
-    return R, line[0], line[1]
+    position, velocity = np.linalg.lstsq(design, target - source @ R.T, rcond=None)[0]
+    return R, position, velocity
 
 
 def inertial_motion(windows: Sequence[Window], bias: gtsam.imuBias.ConstantBias) -> tuple[Floats, Floats]:

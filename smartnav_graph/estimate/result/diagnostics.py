@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -94,15 +95,23 @@ class Updates:
     states: Mapping[str, Floats] = field(default_factory=dict)
 
 
+class _Row(NamedTuple):
+    """What `UpdateLog` keeps of an update; counts : stamp, states solved and linearised anew, rows doubted."""
+
+    counts: tuple[int, int, int, int]
+    corrected: float
+    latency_ms: float
+    window: tuple[Ints, Floats]
+    states: Mapping[str, tuple[float, float]]
+
+
 @dataclass
 class UpdateLog:
     """Collects `Updates` and the latest state after each while a replay runs."""
 
     smoother: Incremental
     states: list[State] = field(default_factory=list)
-    _rows: list[tuple[int, int, int, int, float, float]] = field(default_factory=list)
-    _windows: list[tuple[Ints, Floats]] = field(default_factory=list)
-    _states: list[Mapping[str, tuple[float, float]]] = field(default_factory=list)
+    _rows: list[_Row] = field(default_factory=list)
 
     def take(self, update: GraphUpdate, begin_s: float) -> None:
         """Record what `update` led to; it was begun at `begin_s` (time.perf_counter)."""
@@ -110,29 +119,25 @@ class UpdateLog:
         assert state is not None
         self.states.append(state)
         latency_s, window = time.perf_counter() - begin_s, smoother.recent()
-        corrected = _largest_move(self._windows[-1], window) if self._windows else 0.0
-        effort = smoother.effort
-        row = (update.t_ns, effort.solved, effort.relinearised, doubted_rows(update), corrected, 1e3 * latency_s)
-        self._rows.append(row)
-        self._windows.append(window)
-        self._states.append(smoother.session_now())
+        corrected = _largest_move(self._rows[-1].window, window) if self._rows else 0.0
+        counts = (update.t_ns, smoother.effort.solved, smoother.effort.relinearised, doubted_rows(update))
+        self._rows.append(_Row(counts, corrected, 1e3 * latency_s, window, smoother.session_now()))
 
     @property
     def latency_ms(self) -> list[float]:
-        return [row[-1] for row in self._rows]
+        return [row.latency_ms for row in self._rows]
 
     def updates(self) -> Updates:
-        """All updates taken in whole: an interrupt may fall between the lists."""
-        count = min(len(self._rows), len(self._windows), len(self._states))
-        t_ns, solved, relinearised, doubted, corrected, latency = zip(*self._rows[:count], strict=True)
-        windows, states = self._windows[:count], self._states[:count]
+        """All updates taken in whole."""
+        counts, corrected, latency, windows, states = zip(*self._rows, strict=True)
+        t_ns, solved, relinearised, doubted = np.array(counts, dtype=np.int64).T
         names = dict.fromkeys(name for row in states for name in row)
         unknown = (np.nan, np.nan)
         return Updates(
-            t_ns=np.array(t_ns, dtype=np.int64),
-            solved=np.array(solved, dtype=np.int64),
-            relinearised=np.array(relinearised, dtype=np.int64),
-            doubted=np.array(doubted, dtype=np.int64),
+            t_ns=t_ns,
+            solved=solved,
+            relinearised=relinearised,
+            doubted=doubted,
             corrected=np.array(corrected),
             latency_ms=np.array(latency),
             edge=np.cumsum([0, *(len(t) for t, _ in windows)]),

@@ -48,15 +48,11 @@ SCALES = (0.3, 3.0)
 def check_tracks(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The pass state with the tracks that agree with an estimate; unchanged until pairs are all tested, and once tracks
     are."""
-    found, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
-    if found is None or found.selection(pass_state).refused or pass_state.tests(found.name) >= ROUNDS:
+    builder, pairs = one_of(builders, SmartBuilder), one_of(builders, CoplanarityBuilder)
+    if builder is None or builder.selection(pass_state).refused or pass_state.tests(builder.name) >= ROUNDS:
         return pass_state
     if pairs is not None and (pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused):
         return pass_state
-    return _tested(found, estimate, pass_state)
-
-
-def _tested(builder: SmartBuilder, estimate: Estimate, pass_state: PassState) -> PassState:
     tests, seen, before = pass_state.tests(builder.name), builder.sightings, builder.selection(pass_state)
     if not tests:
         before = replace(before, boresight=estimate.session_value(BORESIGHT, 3))
