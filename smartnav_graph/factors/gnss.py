@@ -273,9 +273,10 @@ class PositionBuilder(Builder):
 
     def _add_native(self, update: GraphUpdate, row: int, model: gtsam.noiseModel.Base) -> None:
         pose, tag = key("X", update.index), FactorId(self.name, update.t_ns, row)
-        arm = [self.lever[row]] if self.lever[row].any() else []
-        factor = gtsam.GPSFactorArm if arm else gtsam.GPSFactor
-        update.add(tag, factor(pose, self.position[row], *arm, model))
+        if self.lever[row].any():
+            update.add(tag, gtsam.GPSFactorArm(pose, self.position[row], self.lever[row], model))
+        else:
+            update.add(tag, gtsam.GPSFactor(pose, self.position[row], model))
 
 
 def build(context: FactorContext) -> PositionBuilder | None:
