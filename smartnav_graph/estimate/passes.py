@@ -242,7 +242,6 @@ def causal_start(
 
 
 def _preintegration_s(problem: Problem) -> float:
-    """Wall seconds of preintegration so far."""
     imu = one_of(problem.builders, ImuBuilder)
     return 0.0 if imu is None else imu.cache.seconds
 

@@ -72,7 +72,6 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
 
 
 def _causal(problem: Problem, initial: InitialState) -> PassState:
-    """The pass state of a replay: everything takes part from the start."""
     correlated = frozenset(
         b.name for b in position_builders(problem.builders) if b.has_correlated_error(initial.pass_state)
     )

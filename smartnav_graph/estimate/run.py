@@ -119,7 +119,6 @@ def _finish(
 
 
 def _refuse_empty(problem: Problem, pass_state: PassState) -> None:
-    """All fixes rejected is no solution."""
     counts = used_counts(problem, pass_state)
     if counts and not any(counts.values()):
         rows = ", ".join(f"{name} {len(pass_state.rejected.get(name, ()))}" for name in counts)

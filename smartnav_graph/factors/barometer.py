@@ -75,7 +75,6 @@ class Height:
     width = 3
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         height, later, weight = data[:, 0], data[:, 1], 1.0 / data[:, 2]
         residual = (p[:, 2] + v[:, 2] * later + extra[0][:, 0] - height) * weight
         by_state = np.zeros((len(p), 1, 9))
@@ -106,7 +105,6 @@ class BarometerBuilder(Builder):
     _start: float = 0.0
 
     def begin(self) -> BarometerBuilder:
-        """See `Builder.begin`."""
         return replace(self, _start=0.0)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:

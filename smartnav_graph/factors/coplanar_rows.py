@@ -176,7 +176,6 @@ class PairRows(Matched):
     """Row model of pairs with every match under a loss of its own."""
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`."""
         rows = data[:, 0].astype(np.intp)
         there = relative(self.rig, states, data)
         found = self.missed(there, rows)
@@ -233,7 +232,6 @@ class CompressedRows(Matched):
         self.floor = BASELINE_FLOOR_M**2 * weight.sum(axis=1) / total
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`."""
         rows = data[:, 0].astype(np.intp)
         there = relative(self.rig, states, data)
         e, by_e = _vectorised(there.R, there.t)

@@ -130,7 +130,6 @@ class CoplanarityBuilder(Builder):
     _made: tuple[tuple[object, ...], RowModel] | None = None
 
     def _none_selected(self) -> PairSelection:
-        """Before anything was tested."""
         rate, motion = np.zeros((len(self.image_ns), 3)), Motion.unknown(len(self.image_ns))
         verdict = np.full(len(self.seen), OUTSIDE, dtype=np.intp)
         return PairSelection(self.seen, self.seen.there.copy(), rate, motion, verdict)
@@ -175,7 +174,6 @@ class CoplanarityBuilder(Builder):
             update.hold(pass_state.fixed_states)
 
     def _ending(self, image: int) -> NDArray[np.intp]:
-        """Pairs whose second image this is, and whose first one has a keyframe."""
         first, last = np.searchsorted(self.seen.images[:, 1], [image, image + 1])
         return np.array([k for k in range(first, last) if int(self.seen.images[k, 0]) in self._keyframe], dtype=np.intp)
 
@@ -206,22 +204,18 @@ class CoplanarityBuilder(Builder):
         return pass_state.tests(SMART) > 0 and not pass_state.causal
 
     def begin(self) -> CoplanarityBuilder:
-        """See `Builder.begin`."""
         return replace(self, _causal=None, _keyframe={}, _turn={}, _now=np.eye(3), _made=None)
 
     def end(self, pass_state: PassState) -> PassState:
-        """See `Builder.end`."""
         if self._causal is None:
             return pass_state
         return replace(pass_state, selections={**pass_state.selections, self.name: self._causal})
 
     def _carry(self, window: Window, previous: State) -> None:
-        """Carry the attitude since the start over one window."""
         for turn in exp((window.gyro - previous.bias.gyroscope()) * window.dt[:, None]):
             self._now = self._now @ turn
 
     def _image_at(self, t_ns: int) -> int | None:
-        """The image whose keyframe this is."""
         near = int(np.searchsorted(self.image_ns, t_ns - self.merge_ns))
         found = near < len(self.image_ns) and abs(int(self.image_ns[near]) - t_ns) <= self.merge_ns
         return near if found else None

@@ -208,7 +208,6 @@ def _folds(start: Floats, margin_s: float) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _flat(features: Sequence[Feature]) -> list[Floats]:
-    """Targets of the weights of a mean: the mean of all features, or the straight line between the borders."""
     border = np.array([float(a == b) for _, a, b in features])
     return [np.full(len(features), 1.0 / len(features)), border / border.sum()]
 
@@ -300,7 +299,6 @@ def bridged(imu: Imu, gaps: Sequence[Gap], found: Mapping[int, Bridge]) -> Imu:
 
 
 def _inner(gap: Gap, imu: Imu) -> NDArray[np.int64]:
-    """Stamps strictly inside a gap, at the recording's rate."""
     period = max(int(np.median(np.diff(imu.t_ns))), 1)
     return np.arange(gap.start_ns + period, gap.end_ns, period, dtype=np.int64)
 

@@ -71,7 +71,6 @@ class PositionFix:
         self.extra = extra
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         states = dict(zip(self.extra, extra, strict=True))
         lever = data[:, 3:6] + states.get("L", 0.0)
         weight = 1.0 / data[:, 6:9, None]
@@ -129,7 +128,6 @@ class PositionBuilder(Builder):
         self.lever = np.broadcast_to(self.lever, self.position.shape)
 
     def begin(self) -> PositionBuilder:
-        """See `Builder.begin`."""
         return replace(self, _level=PredictionLevel(3))
 
     @classmethod
@@ -179,7 +177,6 @@ class PositionBuilder(Builder):
         return self.config.loss in ("gate", "gnc")
 
     def _loss_of(self, row: int, sigma: Floats, update: GraphUpdate, pass_state: PassState) -> str:
-        """Loss of one fix in the phase at hand; see `PassState`."""
         if not self.gated:
             return self.config.loss
         if not pass_state.causal or update.variance is None:
@@ -195,7 +192,6 @@ class PositionBuilder(Builder):
         return bool(self._states(replace(pass_state, stage=LAST_STAGE))) or self.has_correlated_error(pass_state)
 
     def _states(self, pass_state: PassState) -> dict[str, SessionState]:
-        """Session states in use, by letter."""
         if pass_state.stage < LAST_STAGE:
             return {}
         clock, lever = self.config.time_offset_sigma, self.config.lever_arm_sigma

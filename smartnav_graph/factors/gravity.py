@@ -67,7 +67,6 @@ class Upright:
     width = 4
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         (bias,) = extra
         force, weight = data[:, :3] - bias[:, :3], 1.0 / data[:, 3:4]
         level = R[:, :2] * weight[:, :, None]
@@ -122,7 +121,6 @@ class GravityBuilder(Builder):
     _begin_ns: int = 0
 
     def begin(self) -> GravityBuilder:
-        """See `Builder.begin`."""
         return replace(self, _stretch=Stretch(), _begin_ns=0)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:

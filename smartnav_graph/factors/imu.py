@@ -145,7 +145,6 @@ class ImuBuilder(Builder):
         return params
 
     def _gap(self, window: Window) -> Gap | None:
-        """The gap that a window lies in."""
         if window.kind != "gap":
             return None
         middle = (window.t0_ns + window.t1_ns) // 2
@@ -202,7 +201,6 @@ class ImuBuilder(Builder):
         return np.asarray(scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration)
 
     def _factor(self, window: Window, pim: Pim, pass_state: PassState) -> gtsam.NoiseModelFactor:
-        """Factor of a window with the noise of `pass_state`."""
         i, j = window.index - 1, window.index
         factor = gtsam.ImuFactor(key("X", i), key("V", i), key("X", j), key("V", j), key("B", i), pim)
         if (pass_state.scale("accel"), pass_state.scale("gyro")) == self.cache.windows[j].scales:

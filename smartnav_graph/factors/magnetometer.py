@@ -77,7 +77,6 @@ class SeenField:
     width = 15
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         iron, strength = extra
         y, A, north, weight = data[:, :3], data[:, 3:12].reshape(-1, 3, 3), data[:, 12:14], 1.0 / data[:, 14:15]
         body_R_nav = R.transpose(0, 2, 1)

@@ -67,7 +67,6 @@ class AtKeyframe:
         self.letters: tuple[str, ...] = ("X", "V", *observation.extra)
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`."""
         pose, v, *extra = states
         R = pose[:, :3, :3]
         residual, by, by_extra = self.observation.observe(R, pose[:, :3, 3], v, extra, data)
@@ -179,7 +178,6 @@ class AtInstant:
         self.letters: tuple[str, ...] = ("X", "V", *bias, *clock, *observation.extra)
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`."""
         pose, velocity, *rest = states
         at = _unpack(data[:, self.observation.width :])
         bias = at["bias"] if self.short else rest.pop(0)

@@ -79,7 +79,6 @@ class AttitudeFix:
         self.extra = extra
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         fix, mount = data[:, :9].reshape(-1, 3, 3), data[:, 9:18].reshape(-1, 3, 3)
         weight = 1.0 / data[:, 18:21, None]
         predicted = R @ mount @ (exp(extra[0]) if extra else np.eye(3))
@@ -127,7 +126,6 @@ class AttitudeBuilder(Builder):
         return self.config.gate_probability if self.config.loss == "gate" else None
 
     def _states(self, pass_state: PassState) -> dict[str, SessionState]:
-        """Session states in use, by letter."""
         if pass_state.stage < LAST_STAGE:
             return {}
         found = {}
@@ -175,7 +173,6 @@ class AttitudeBuilder(Builder):
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 
     def _loss(self, pass_state: PassState) -> str:
-        """Loss in the phase at hand; see `PassState`."""
         if self.config.loss != "gate":
             return self.config.loss
         return "huber" if pass_state.phase in (Phase.ROBUST, Phase.CAUSAL) else "none"

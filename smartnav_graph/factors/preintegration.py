@@ -93,7 +93,6 @@ class InertialRow:
         return np.concatenate([np.ravel(part) for part in parts])
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
-        """See `graph.RowModel`."""
         pose, velocity, pose_j, velocity_j, *rest = states
         at = self.unpacked(data)
         there = propagate(pose, velocity, np.concatenate(rest, axis=1), at)

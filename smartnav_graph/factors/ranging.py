@@ -57,7 +57,6 @@ class AnchorRange:
         self.extra = extra
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         lever, weight = data[:, 3:6], 1.0 / data[:, 7:8]
         way = p + rotate(R, lever) - data[:, :3]
         distance = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), SHORTEST_M)
@@ -90,16 +89,13 @@ class RangeBuilder(Builder):
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(1))
 
     def begin(self) -> RangeBuilder:
-        """See `Builder.begin`."""
         return replace(self, _level=PredictionLevel(1))
 
     @property
     def gate_probability(self) -> float | None:
-        """See `Builder`."""
         return self.config.gate_probability if self.config.loss == "gate" else None
 
     def has_second_stage(self, pass_state: PassState) -> bool:
-        """See `Builder`."""
         return self.bias_sigma > 0
 
     def bias(self, row: int) -> SessionState:
@@ -120,7 +116,6 @@ class RangeBuilder(Builder):
             self._add_row(update, delayed.row, pass_state, loss, delayed.window.index - 1, partial)
 
     def _loss(self, row: int, update: GraphUpdate, pass_state: PassState) -> str:
-        """Loss of a range in the phase at hand; in a replay, where it is inconsistent with its prediction."""
         if self.config.loss != "gate":
             return self.config.loss
         if not pass_state.causal or update.variance is None:

@@ -109,7 +109,6 @@ class SmartBuilder(Builder):
     _keyframe: dict[int, int] = field(default_factory=dict)
 
     def begin(self) -> SmartBuilder:
-        """See `Builder.begin`."""
         return replace(self, _keyframe={})
 
     def selection(self, pass_state: PassState) -> TrackSelection:

@@ -49,7 +49,6 @@ class Level:
     width = 1
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         (floor,) = extra
         weight = 1.0 / data[:, :1]
         by_state = np.zeros((len(p), 1, 9))
@@ -75,7 +74,6 @@ class StandstillBuilder(Builder):
     _floor: SessionState | None = None
 
     def begin(self) -> StandstillBuilder:
-        """See `Builder.begin`."""
         return replace(self, _floor=None)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:

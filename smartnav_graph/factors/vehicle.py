@@ -132,7 +132,6 @@ class NonHolonomic:
         self.extra: tuple[str, ...] = ("M", "G") if in_gap else ("M",)
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         mount, *gap_error = extra
         measured = data[:, :6].reshape(-1, 2, 3)
         for error in gap_error:
@@ -210,7 +209,6 @@ class VehicleBuilder(Builder):
 
     @property
     def noise_groups(self) -> Mapping[str, float]:
-        """See `Builder`."""
         return {"vehicle_lateral": self.noise.lateral_sigma, "vehicle_vertical": self.noise.vertical_sigma}
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:

@@ -49,7 +49,6 @@ class NavVelocity:
     width = 9
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         arm, weight = data[:, 3:6], 1.0 / data[:, 6:9]
         by_state = np.zeros((len(v), 3, 9))
         by_state[:, :, :3] = -R @ skew(arm)
@@ -64,7 +63,6 @@ class BodyVelocity:
     width = 9
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         weight = 1.0 / data[:, 6:9]
         body_R_nav = R.transpose(0, 2, 1)
         body = rotate(body_R_nav, v)

@@ -74,7 +74,6 @@ class RearWheels:
         self.body_R_vehicle = body_R_vehicle
 
     def observe(self, R: Floats, p: Floats, v: Floats, extra: Sequence[Floats], data: Floats) -> Observed:
-        """See `observation.Observation`."""
         mount, wheel = extra
         axes, declared = VehicleAxes.of(mount), DeclaredVelocity.of(R, v, self.body_R_vehicle)
         vel, rate = axes.turn(declared.rows), axes.turn(data[:, 2:5])
@@ -118,7 +117,6 @@ class WheelBuilder(Builder):
 
     @property
     def noise_groups(self) -> Mapping[str, float]:
-        """See `Builder`."""
         return {self.name: self.default_sigma} if self.stream.sigma is None else {}
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:

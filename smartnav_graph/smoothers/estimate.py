@@ -244,7 +244,6 @@ def latest_covariance(net: gtsam.GaussianBayesNet, names: Sequence[int]) -> Floa
 def _earliest_users(
     groups: Sequence[Sequence[int]], conditionals: Mapping[int, gtsam.GaussianConditional]
 ) -> dict[int, int]:
-    """The earliest group that is conditioned on each state."""
     found: dict[int, int] = {}
     for row, names in enumerate(groups):
         for name in names:
@@ -299,7 +298,6 @@ class JointCovariance:
 
 
 def _slices(names: Iterable[int]) -> dict[int, slice]:
-    """Rows of each state in a joint vector."""
     at, start = {}, 0
     for name in names:
         size = kind_of(name).dim

@@ -154,7 +154,6 @@ class FixedLag(Incremental):
 
 
 def _own(update: GraphUpdate) -> list[int]:
-    """States of the body at one keyframe."""
     return [key(letter, update.index) for letter in KEYFRAME_LETTERS]
 
 
@@ -175,7 +174,6 @@ def _eliminated(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, weak: 
 
 
 def _oldest(keys: Iterable[int]) -> int:
-    """Index of the oldest keyframe among states."""
     return min((gtsam.symbolIndex(name) for name in keys if kind_of(name).scope != "session"), default=NEVER)
 
 
@@ -185,7 +183,6 @@ def _split(items: Sequence[tuple[int, Item]], last: int) -> tuple[list[Item], li
 
 
 def _only(block: FactorBatch, mask: Sequence[bool]) -> FactorBatch:
-    """The rows (m,) of a block that a mask leaves."""
     rows = [i for i, kept in enumerate(mask) if kept]
     return replace(
         block,

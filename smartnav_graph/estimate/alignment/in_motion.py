@@ -276,7 +276,6 @@ def _far(bias: Floats, points: Sequence[Floats]) -> bool:
 
 
 def _first_bias(stretch: _Stretch, starts: Sequence[Start]) -> Floats:
-    """Biases (6,) by the first seconds."""
     bias, short = stretch.known.bias_mean, stretch.initial_part()
     if short is None:
         return bias

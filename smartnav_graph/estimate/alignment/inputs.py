@@ -100,7 +100,6 @@ def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
 
 
 def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
-    """Fields of the first stretch by the magnetometer."""
     builder, phase = one_of(problem.builders, MagnetometerBuilder), Phase.CAUSAL if causal else Phase.PLAIN
     stream = problem.session.magnetometer
     if builder is None or stream is None:

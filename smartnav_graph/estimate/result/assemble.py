@@ -168,14 +168,12 @@ def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Par
 
 
 def _weights(builder: PositionBuilder, white: Floats) -> Floats:
-    """Robust weights (n,) of the loss in force."""
     if builder.config.loss != "huber":
         return np.ones(len(white))
     return loss_weights((white**2).sum(axis=1), "huber", dim=white.shape[1])[0]
 
 
 def _flat(parts: Sequence[Part]) -> Residuals:
-    """One row a scalar."""
     if not parts:
         return Residuals.empty()
     width = [rows.shape[1] if rows.ndim == 2 else 0 for _, _, rows, _, _ in parts]
@@ -254,7 +252,6 @@ def resample(problem: Problem, keyframes: Solution) -> Solution:
 
 
 def _image_times(problem: Problem) -> NDArray[np.int64]:
-    """Stamps of all images of which there are matches or tracks."""
     session = problem.session
     found = [stream.t_ns for stream in (session.matches, session.tracks) if stream is not None]
     if session.matches is not None:

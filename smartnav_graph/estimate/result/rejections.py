@@ -29,7 +29,6 @@ def rejections(solved: SolvedProblem) -> list[Rejection]:
 
 
 def _positions(solved: SolvedProblem) -> list[Rejection]:
-    """Fixes that the gate rejected."""
     found: list[Rejection] = []
     problem, estimate = solved.problem, solved.estimate
     for name, residuals in solved.fixes.items():

@@ -52,7 +52,6 @@ def peak_memory_mb() -> float:
 
 
 def _doubts(estimate: Estimate, mode: str, chi2: float) -> list[str]:
-    """Reasons to doubt the solution."""
     doubts = []
     if mode != "batch":
         relative = mode.replace("dead-", "dead ")
@@ -136,7 +135,6 @@ def _session(session: Session) -> dict[str, Any]:
 
 
 def _factor_counts(estimate: Estimate) -> dict[str, int]:
-    """Factors, and rows of blocks, by sensor."""
     counts = Counter(tag.sensor for tag, _ in estimate.factors)
     for block in estimate.blocks:
         counts[block.sensor] += len(block.keys)
@@ -163,7 +161,6 @@ def _rejected(pass_state: PassState, seen: Account | None, tracks: Account | Non
 
 
 def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
-    """The states of the session, and the noise found."""
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     found: dict[str, dict[str, Any]] = {}
     for state in estimate.session.values():
@@ -220,7 +217,6 @@ def _standstills(problem: Problem) -> dict[str, Any]:
 
 
 def _sigma_summary(solution: Solution) -> dict[str, float]:
-    """Horizontal one-sigma: median, 95 % and largest, metres."""
     horizontal = np.hypot(*solution.sigmas[:, POS][:, :2].T)
     return {
         "median": float(np.median(horizontal)),
