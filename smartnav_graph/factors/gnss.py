@@ -259,7 +259,7 @@ class PositionBuilder(Builder):
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = row_model(PositionFix, extra, timed="T" in states, here=index == update.index)
+        model = row_model(PositionFix, extra, timed="T" in states, later=index != update.index)
         keys = update.keys(model.letters, index, states)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

@@ -195,10 +195,10 @@ class AtInstant:
 
 @cache
 def row_model(
-    kind: Callable[[tuple[str, ...]], Observation], extra: tuple[str, ...], *, timed: bool = False, here: bool = True
+    kind: Callable[[tuple[str, ...]], Observation], extra: tuple[str, ...], *, timed: bool = False, later: bool = False
 ) -> RowModel:
-    """The one row model of a kind of observation with some `extra` states; here : at the keyframe, not after it."""
-    return AtInstant(kind(extra), timed=timed, short=here) if timed or not here else AtKeyframe(kind(extra))
+    """The one row model of a kind of observation with some `extra` states; later : than its keyframe."""
+    return AtInstant(kind(extra), timed=timed, short=not later) if timed or later else AtKeyframe(kind(extra))
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ class AttitudeBuilder(Builder):
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
         used = not (pass_state.is_rejected(self.name, row) or pass_state.is_rejected(NAME, row))
-        model = row_model(AttitudeFix, ("A",) * ("A" in states), timed="T" in states, here=index == update.index)
+        model = row_model(AttitudeFix, ("A",) * ("A" in states), timed="T" in states, later=index != update.index)
         keys, loss = update.keys(model.letters, index, states), self._loss(pass_state)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 

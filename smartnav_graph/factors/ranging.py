@@ -143,7 +143,7 @@ class RangeBuilder(Builder):
         data = np.concatenate([self.anchor[row], self.lever, [self.distance[row], self.sigma[row]]])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])
-        model = row_model(AnchorRange, tuple(states), here=partial is None)
+        model = row_model(AnchorRange, tuple(states), later=partial is not None)
         keys, used = update.keys(model.letters, index, states), not pass_state.is_rejected(self.name, row)
         update.blocks.append(FactorBatch(self.name, model, [keys], data[None], update.t_ns, (row,), (used,), loss))
 
