@@ -130,6 +130,7 @@ class CoplanarityBuilder(Builder):
     _made: tuple[tuple[object, ...], RowModel] | None = None
 
     def _none_selected(self) -> PairSelection:
+        """Before anything was tested."""
         rate, motion = np.zeros((len(self.image_ns), 3)), Motion.unknown(len(self.image_ns))
         verdict = np.full(len(self.seen), OUTSIDE, dtype=np.intp)
         return PairSelection(self.seen, self.seen.there.copy(), rate, motion, verdict)

@@ -208,6 +208,7 @@ def _folds(start: Floats, margin_s: float) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _flat(features: Sequence[Feature]) -> list[Floats]:
+    """Targets of the weights of a mean: the mean of all features, or the straight line between the borders."""
     border = np.array([float(a == b) for _, a, b in features])
     return [np.full(len(features), 1.0 / len(features)), border / border.sum()]
 

@@ -177,6 +177,7 @@ class PositionBuilder(Builder):
         return self.config.loss in ("gate", "gnc")
 
     def _loss_of(self, row: int, sigma: Floats, update: GraphUpdate, pass_state: PassState) -> str:
+        """Loss of one fix in the phase at hand; see `PassState`."""
         if not self.gated:
             return self.config.loss
         if not pass_state.causal or update.variance is None:

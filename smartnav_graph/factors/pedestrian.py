@@ -147,6 +147,7 @@ class StepBuilder(Builder):
         return count > 0 and bool(self.steps.regular_seconds[count - 1] >= WALK * (t_ns - self.start_ns) / NS)
 
     def _length(self, window: Window, R: Floats, gyro_bias: Floats) -> complex:
+        """S of one window."""
         ends = window.t0_ns + ns_from_seconds(np.cumsum(window.dt))
         part = np.diff(self.steps.travelled(np.concatenate([[window.t0_ns], ends])))
         if not part.any():

@@ -116,6 +116,7 @@ class RangeBuilder(Builder):
             self._add_row(update, delayed.row, pass_state, loss, delayed.window.index - 1, partial)
 
     def _loss(self, row: int, update: GraphUpdate, pass_state: PassState) -> str:
+        """Loss of a range in the phase at hand; in a replay, where it is inconsistent with its prediction."""
         if self.config.loss != "gate":
             return self.config.loss
         if not pass_state.causal or update.variance is None:

@@ -244,6 +244,7 @@ def latest_covariance(net: gtsam.GaussianBayesNet, names: Sequence[int]) -> Floa
 def _earliest_users(
     groups: Sequence[Sequence[int]], conditionals: Mapping[int, gtsam.GaussianConditional]
 ) -> dict[int, int]:
+    """The earliest group that is conditioned on each state."""
     found: dict[int, int] = {}
     for row, names in enumerate(groups):
         for name in names:

@@ -90,6 +90,7 @@ def _linearized(estimate: Estimate) -> tuple[list[str], Any]:
 
 
 def _states(linear: Any, estimate: Estimate) -> tuple[list[int], list[list[int]]]:
+    """Keys of the session states of a linear system, and of the states of each keyframe."""
     groups = {index: [key(letter, index) for letter in KEYFRAME_LETTERS] for index in estimate.indices}
     names = np.array(sorted(linear.keys()), dtype=np.uint64)
     session = []

@@ -72,6 +72,7 @@ def multilaterate(ranges: Ranges, anchor: Floats, sigma: Floats) -> Multilaterat
 
 
 def _check_plan(ranges: Ranges, anchor: Floats) -> None:
+    """Refuse anchors that leave the position in plan ambiguous."""
     _, rows = np.unique(ranges.anchor_id.astype(str), return_index=True)
     plan = anchor[rows, :2] - anchor[rows, :2].mean(axis=0)
     axes = np.linalg.svd(plan, compute_uv=False)

@@ -152,6 +152,7 @@ def _tracked(windows: Sequence[Window], steps: Steps, body_R_vehicle: Floats) ->
 
 
 def _level(windows: Sequence[Window]) -> Floats:
+    """Attitude of arbitrary heading whose up is the mean force of the first seconds."""
     first = [w for w in windows if w.t1_ns - windows[0].t1_ns <= LEVELLING_S * NS] or list(windows)
     mean = np.concatenate([w.accel for w in (first if len(first) > 1 else windows)]).mean(axis=0)
     up = mean / np.linalg.norm(mean)

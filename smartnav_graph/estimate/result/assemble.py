@@ -168,6 +168,7 @@ def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Par
 
 
 def _weights(builder: PositionBuilder, white: Floats) -> Floats:
+    """Robust weights (n,) of the loss in force."""
     if builder.config.loss != "huber":
         return np.ones(len(white))
     return loss_weights((white**2).sum(axis=1), "huber", dim=white.shape[1])[0]
@@ -252,6 +253,7 @@ def resample(problem: Problem, keyframes: Solution) -> Solution:
 
 
 def _image_times(problem: Problem) -> NDArray[np.int64]:
+    """Stamps of all images of which there are matches or tracks."""
     session = problem.session
     found = [stream.t_ns for stream in (session.matches, session.tracks) if stream is not None]
     if session.matches is not None:

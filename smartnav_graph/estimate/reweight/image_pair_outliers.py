@@ -167,6 +167,7 @@ def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estima
 
 
 def _refusal(verdict: NDArray[np.intp]) -> str:
+    """Why no pair is to be used; empty where they are."""
     kept, asked = int((verdict == IN_USE).sum()), int(np.isin(verdict, [IN_USE, CONTRARY]).sum())
     if kept >= LEAST_PAIRS * asked:
         return ""

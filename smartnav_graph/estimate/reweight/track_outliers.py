@@ -129,6 +129,7 @@ def _verdict(builder: SmartBuilder, use: Mask, points: TrackPoints) -> NDArray[n
 
 
 def _refusal(verdict: NDArray[np.intp]) -> str:
+    """Why no track is to be used; empty where they are."""
     kept, asked = int((verdict == IN_USE).sum()), int(np.isin(verdict, [IN_USE, CONTRARY]).sum())
     if kept >= LEAST_SHARE * asked and kept:
         return ""

@@ -162,6 +162,7 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
 
 
 def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
+    """Normalised square of the fixes in use over their redundancy, at least 1."""
     square = redundancy = 0.0
     for name, (_, one) in found.items():
         used = pass_state.used(name, one.rows)
