@@ -15,7 +15,6 @@ from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
-from smartnav_graph.session.calibration.apply import corrected
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.holdout import split
@@ -92,7 +91,7 @@ def calibrate(session: Session, notes: Notes) -> Session:
     notes.calibration = known or Calibration()
     if known is None or known.imu_errors == ImuErrors():
         return session
-    imu = corrected(session.require_imu(), known.imu_errors)
+    imu = known.imu_errors.corrected(session.require_imu())
     return session.replace(imu=imu, calibration=replace(known, imu_errors=ImuErrors()))
 
 

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import cattrs
+import numpy as np
 import tomli_w
 
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.streams import Imu
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -201,6 +203,17 @@ class ImuErrors:
                 )
         if not all(map(math.isfinite, (*self.accel_bias, *self.gyro_bias))):
             raise CalibrationError("calibration.toml", f"{self}", "finite biases", "give m/s^2 and rad/s")
+
+    def corrected(self, imu: Imu) -> Imu:
+        """True rate and force, matrix (reading - bias); the same object where there is nothing to do."""
+        if self == ImuErrors():
+            return imu
+        accel, gyro = (np.reshape(matrix, (3, 3)).T for matrix in (self.accel_matrix, self.gyro_matrix))
+        return dataclasses.replace(
+            imu,
+            accel=(imu.accel - np.array(self.accel_bias)) @ accel,
+            gyro=(imu.gyro - np.array(self.gyro_bias)) @ gyro,
+        )
 
 
 @dataclass(frozen=True)

@@ -76,11 +76,6 @@ def shoe(imu: Imu, width: int, gravity: float) -> Floats:
     return np.asarray(force / FORCE_UNIT**2 + _rate_energy(imu, width))
 
 
-def angular_rate_energy(imu: Imu, width: int, gravity: float) -> Floats:
-    """Statistic (n,) of the angular rate alone."""
-    return _rate_energy(imu, width)
-
-
 def acceleration_variance(imu: Imu, width: int, gravity: float) -> Floats:
     """Statistic (n,) of the variance of the specific force alone."""
     centred = imu.accel - imu.accel.mean(axis=0)
@@ -90,7 +85,7 @@ def acceleration_variance(imu: Imu, width: int, gravity: float) -> Floats:
 
 DETECTORS: dict[str, Callable[[Imu, int, float], Floats]] = {
     "shoe": shoe,
-    "are": angular_rate_energy,
+    "are": lambda imu, width, gravity: _rate_energy(imu, width),
     "amv": acceleration_variance,
 }
 

@@ -87,11 +87,18 @@ def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
     Streams that will not be used can be left out: ``inspect(session.replace(magnetometer=None))``.
     """
     imu = session.imu
-    usable = imu is not None and len(imu) >= 2
+    usable = imu if imu is not None and len(imu) >= 2 else None
     if gaps is None:
-        gaps = find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel])) if usable and imu is not None else ()
-    facts = Facts(session, tuple(gaps), quiet_accel(imu) if usable and imu is not None else None)
+        gaps = [] if usable is None else find_gaps(usable.t_ns, np.hstack([usable.gyro, usable.accel]))
+    facts = Facts(session, tuple(gaps), None if usable is None else quiet_accel(usable))
     findings = [finding for rule in RULES for finding in rule(facts)]
+    parts = {
+        "imu": imu is not None,
+        f"absolute sensor ({', '.join(ABSOLUTE)})": bool(session.absolute()),
+        "origin": session.origin is not None,
+        "calibration": session.calibration is not None,
+        "reference": session.reference is not None,
+    }
     order = {"error": 0, "warning": 1, "info": 2}
     return Health(
         streams=tuple(_stream_health(session, name, stream) for name, stream in session.streams().items()),
@@ -99,7 +106,7 @@ def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
         clock_epoch=session.clock_epoch,
         gravity_m_s2=session.gravity,
         quiet_accel_m_s2=facts.quiet_accel,
-        missing=_missing(session),
+        missing=tuple(name for name, there in parts.items() if not there),
         findings=tuple(sorted(findings, key=lambda finding: order[finding.level])),
         t0_ns=session.t0_ns,
     )
@@ -111,15 +118,6 @@ def _stream_health(session: Session, name: str, stream: Stream) -> StreamHealth:
     start, end = session.seconds(stream.t_ns[[0, -1]])
     length = float(end - start)
     return StreamHealth(name, len(stream), float(start), length, (len(stream) - 1) / length if length else np.nan)
-
-
-def _missing(session: Session) -> tuple[str, ...]:
-    streams = session.streams()
-    out = [] if "imu" in streams else ["imu"]
-    out += [] if any(name in streams for name in ABSOLUTE) else [f"absolute sensor ({', '.join(ABSOLUTE)})"]
-    out += ["origin"] if session.origin is None else []
-    out += ["calibration"] if session.calibration is None else []
-    return (*out, *([] if "reference" in streams else ["reference"]))
 
 
 RULES: tuple[Callable[[Facts], Iterator[Finding]], ...] = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,16 +17,19 @@ from smartnav_graph.session.streams import STREAMS, Imu
 AIDING = tuple(name for name, kind in STREAMS.items() if kind.AIDING)
 LEAST_ROWS = 10  # shorter streams are not checked
 CHORD_S = 4.0  # s between the fixes of a speed
+_SPEEDS = {3.6: "km/h", 1.944: "knots", 2.237: "mph", 3.281: "ft/s", 100.0: "cm/s", 1000.0: "mm/s"}
+_NEAR = 0.06  # of a unit's factor
+_ODD = 1.3  # a factor that slip or tyres do not explain
 
 
 @dataclass(frozen=True)
 class Finding:
     """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``."""
 
-    level: str
     where: str
     text: str
     remedy: str = ""
+    level: str = "warning"
 
     def __str__(self) -> str:
         return f"{self.where}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")
@@ -89,6 +93,20 @@ def fix_sigma(stream: Positioned) -> Floats:
     if stream.sigma is None:
         return np.full(len(stream), 5.0)
     return np.asarray(np.linalg.norm(np.nan_to_num(stream.sigma[:, :2], nan=5.0), axis=1))
+
+
+def odd_speed(where: str, what: str, measured: Floats, known: Floats) -> Iterator[Finding]:
+    """Speeds (n,) of a sensor against those known from elsewhere (n,) m/s."""
+    if len(measured) < LEAST_ROWS:
+        return
+    factor = float(np.median(measured / known))
+    scatter = float(np.median(np.abs(measured / known - factor)))
+    if 1.0 / _ODD < factor < _ODD or scatter > 0.3 * abs(factor):
+        return
+    unit = next((name for f, name in _SPEEDS.items() if abs(factor / f - 1.0) < _NEAR), None)
+    looks = f": it looks like {unit}" if unit else ""
+    text = f"{what} is {factor:.3g} times the speed of the fixes{looks}"
+    yield Finding(where, text, f"divide {what} by {factor:.4g}" if unit is None else "give m/s")
 
 
 def over_chords(chords: Chords, t_ns: Times, values: Floats) -> Floats:

@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import frames
-from smartnav_graph.core.arrays import Floats, Indices, Mask, Times
+from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.session.health.facts import (
     CHORD_S,
@@ -60,7 +60,7 @@ def _gaps(facts: Facts) -> Iterator[Finding]:
             total, longest = sum(gap.length_s for gap in gaps), max(gaps, key=lambda gap: gap.length_s)
             at, count = float(facts.session.seconds(longest.start_ns)), count_of(len(gaps), "data gap")
             text = f"{count} {what}, {total:.2f} s in all, longest {longest.length_s:.2f} s at {at:.2f} s"
-            yield Finding("warning", "imu", text, "the uncertainty grows there; fixes around them help")
+            yield Finding("imu", text, "the uncertainty grows there; fixes around them help")
 
 
 def _accel_unit(facts: Facts) -> Iterator[Finding]:
@@ -69,16 +69,16 @@ def _accel_unit(facts: Facts) -> Iterator[Finding]:
     median = float(np.median(np.linalg.norm(facts.imu.accel, axis=1)))
     g, found = facts.session.gravity, f"median |accel| {median:.3g} m/s^2, expected about {facts.session.gravity:.4g}"
     if abs(median - 1.0) < 0.2:
-        yield Finding("warning", "imu", f"{found}: it looks like units of g", "multiply accel by 9.80665")
+        yield Finding("imu", f"{found}: it looks like units of g", "multiply accel by 9.80665")
     elif abs(median - g * g) < 0.2 * g * g:
-        yield Finding("warning", "imu", f"{found}: it looks scaled by 9.81 twice", "divide accel by 9.80665")
+        yield Finding("imu", f"{found}: it looks scaled by 9.81 twice", "divide accel by 9.80665")
     elif median < 0.5 * g:
-        yield Finding("warning", "imu", f"{found}: gravity seems removed", "import specific force, gravity included")
+        yield Finding("imu", f"{found}: gravity seems removed", "import specific force, gravity included")
     elif median > 2.0 * g:
-        yield Finding("warning", "imu", f"{found}: {median / g:.3g} times too large", "import accel in m/s^2")
+        yield Finding("imu", f"{found}: {median / g:.3g} times too large", "import accel in m/s^2")
     elif facts.quiet_accel is not None and abs(facts.quiet_accel - g) > 0.1 * g:
         text = f"|accel| at rest {facts.quiet_accel:.3f} m/s^2, {100 * (facts.quiet_accel / g - 1):+.1f} % off gravity"
-        yield Finding("warning", "imu", text, "calibrate the accelerometer, or check gravity_m_s2 of the session")
+        yield Finding("imu", text, "calibrate the accelerometer, or check gravity_m_s2 of the session")
 
 
 def _accel_sign(facts: Facts) -> Iterator[Finding]:
@@ -88,7 +88,7 @@ def _accel_sign(facts: Facts) -> Iterator[Finding]:
     along = float((facts.imu.accel @ frames.axis_vector(up)).mean())
     if along < -0.5 * norm:
         text = f"accel along the up axis {up} averages {along:.3g} m/s^2, but specific force points up"
-        yield Finding("warning", "imu", text, "flip the sign of accel, or correct [device] up in session.toml")
+        yield Finding("imu", text, "flip the sign of accel, or correct [device] up in session.toml")
 
 
 def _gyro_unit(facts: Facts) -> Iterator[Finding]:
@@ -100,18 +100,18 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
     degrees = "multiply gyro by pi/180"
     if high > _MAX_RATE:
         text = f"99.9 % quantile of |gyro| is {high:.3g} rad/s, beyond 2000 deg/s: it looks like deg/s"
-        yield Finding("warning", "imu", text, degrees)
+        yield Finding("imu", text, degrees)
     elif rms > _MAX_RMS_RATE:
-        yield Finding("warning", "imu", f"RMS |gyro| is {rms:.3g} rad/s: it looks like deg/s", degrees)
+        yield Finding("imu", f"RMS |gyro| is {rms:.3g} rad/s: it looks like deg/s", degrees)
     elif errors is not None and errors[1.0] > 20.0 and errors[np.pi / 180] < errors[1.0] / 4:
         text = f"integrated gyro turns gravity {errors[1.0]:.0f} deg away from accel within 2 s: it looks like deg/s"
-        yield Finding("warning", "imu", text, degrees)
+        yield Finding("imu", text, degrees)
     elif errors is not None and errors[1.0] > 5.0 and errors[-1.0] < errors[1.0] / 4:
         text = "gyro turns against the tilt that accel shows: its sign is wrong"
-        yield Finding("warning", "imu", text, "flip the sign of gyro")
+        yield Finding("imu", text, "flip the sign of gyro")
     elif errors is not None and errors[1.0] > 5.0 and errors[180 / np.pi] < errors[1.0] / 4:
         text = "accel tilts 57.3 times faster than gyro turns: gyro looks converted from deg to rad twice"
-        yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
+        yield Finding("imu", text, "multiply gyro by 180/pi")
 
 
 def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
@@ -162,11 +162,11 @@ def _gyro_course(facts: Facts) -> Iterator[Finding]:
     correlation, slope = _fit(course, gyro, np.abs(gyro) > _CLEAR_TURN)
     if correlation < -_CORRELATED and 0.5 < -slope < 2.0:
         text = "gyro turns against the course of the fixes: its sign is wrong, or the fixes are mirrored"
-        yield Finding("warning", "imu", text, "flip the sign of gyro, or exchange latitude and longitude of the fixes")
+        yield Finding("imu", text, "flip the sign of gyro, or exchange latitude and longitude of the fixes")
     correlation, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
     if correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the fixes turn {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
-        yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
+        yield Finding("imu", text, "multiply gyro by 180/pi")
 
 
 def _fit(course: Floats, gyro: Floats, clear: Mask) -> tuple[float, float]:
@@ -205,17 +205,14 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
     for name, column in zip(names, signal.T, strict=True):
         triad = imu.gyro if name.startswith("gyro") else imu.accel
         if (column == column[0]).all() and not (triad == triad[0]).all():
-            yield Finding("warning", "imu", f"{name} is {column[0]:g} in all {len(imu)} rows", "import the log again")
+            yield Finding("imu", f"{name} is {column[0]:g} in all {len(imu)} rows", "import the log again")
     frozen = [run for run in repeats(signal) if (imu.t_ns[run[1]] - imu.t_ns[run[0]]) / NS > _FROZEN_S]
     if frozen and frozen[0] != (0, len(imu) - 1):
-        at, seconds = float(facts.session.seconds(imu.t_ns[frozen[0][0]])), _length(imu.t_ns, frozen)
+        at = float(facts.session.seconds(imu.t_ns[frozen[0][0]]))
+        seconds = sum(float(imu.t_ns[last] - imu.t_ns[first]) for first, last in frozen) / NS
         where = f"{count_of(len(frozen), 'stretch', 'es')}, first at {at:.1f} s"
         text = f"repeats one row of readings for {seconds:.1f} s in {where}"
-        yield Finding("warning", "imu", text, "sensor output frozen; remove the rows so that they count as a gap")
-
-
-def _length(t_ns: Times, runs: list[tuple[int, int]]) -> float:
-    return sum(float(t_ns[last] - t_ns[first]) for first, last in runs) / NS
+        yield Finding("imu", text, "sensor output frozen; remove the rows so that they count as a gap")
 
 
 def _clipped(facts: Facts) -> Iterator[Finding]:
@@ -228,7 +225,7 @@ def _clipped(facts: Facts) -> Iterator[Finding]:
         at_top = size >= top * (1 - 1e-6)
         if top > least and at_top.sum() >= LEAST_ROWS and (at_top[1:] & at_top[:-1]).sum() >= LEAST_ROWS // 2:
             text = f"|{name}| is {top:.4g} in {int(at_top.sum())} rows: the end of its range"
-            yield Finding("warning", "imu", text, "choose a larger range when recording; the motion there is lost")
+            yield Finding("imu", text, "choose a larger range when recording; the motion there is lost")
 
 
 RULES = (_accel_unit, _accel_sign, _gyro_unit, _gyro_course, _frozen, _clipped, _gaps)

@@ -9,8 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, decimated, over_chords, repeats
-from smartnav_graph.session.health.units import odd_speed
+from smartnav_graph.session.health.facts import (
+    LEAST_ROWS,
+    Facts,
+    Finding,
+    count_of,
+    decimated,
+    odd_speed,
+    over_chords,
+    repeats,
+)
 from smartnav_graph.session.stream import Positioned
 
 _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
@@ -35,7 +43,7 @@ def _jumps(facts: Facts) -> Iterator[Finding]:
         if jump.any():
             at = float(facts.session.seconds(stream.t_ns[1:][jump][0]))
             text = f"{count_of(int(jump.sum()), 'jump')} faster than {_MAX_FIX_SPEED:g} m/s, the first at {at:.3f} s"
-            yield Finding("warning", name, text, "keep a robust loss on, or remove the outliers")
+            yield Finding(name, text, "keep a robust loss on, or remove the outliers")
 
 
 def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
@@ -43,12 +51,12 @@ def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
         if not isinstance(stream, Positioned):
             continue
         if stream.sigma is None:
-            yield Finding("info", name, "has no sigma columns", "the default of the device class will be used")
+            yield Finding(name, "has no sigma columns", "the default of the device class will be used", "info")
         elif bad := int(np.isnan(stream.sigma).any(axis=1).sum()):
             text = f"{bad} of {len(stream)} rows have no sigma"
-            yield Finding("info", name, text, "the default of the device class will be used there")
+            yield Finding(name, text, "the default of the device class will be used there", "info")
         if facts.session.mount(name).frame == "msl":
-            yield Finding("info", name, "heights are above mean sea level, not above the ellipsoid")
+            yield Finding(name, "heights are above mean sea level, not above the ellipsoid", level="info")
 
 
 def _exchanged(facts: Facts) -> Iterator[Finding]:
@@ -65,13 +73,13 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
                 apart = f"lies {np.radians(away) * 6.4e3:.0f} km from {other}"
                 if turned < 0.5:
                     text = f"{apart}, and near it with latitude and longitude exchanged"
-                    yield Finding("warning", name, text, f"exchange lat_deg and lon_deg of {name} or of {other}")
+                    yield Finding(name, text, f"exchange lat_deg and lon_deg of {name} or of {other}")
                 else:
-                    yield Finding("warning", name, apart, "check lat_deg, lon_deg and [origin]")
+                    yield Finding(name, apart, "check lat_deg, lon_deg and [origin]")
     for name, lla in _geodetic(facts).items():
         if np.abs(lla[:, 0]).max() < np.pi / 2 and np.abs(lla[:, 1]).max() < np.pi:
             text = "latitudes and longitudes are all within pi of zero, where there is no land: they look like radians"
-            yield Finding("warning", name, text, "give degrees")
+            yield Finding(name, text, "give degrees")
 
 
 def _geodetic(facts: Facts) -> dict[str, Floats]:
@@ -91,12 +99,10 @@ def _heights(facts: Facts) -> Iterator[Finding]:
     for name, lla in _geodetic(facts).items():
         height = lla[:, 2]
         if len(height) >= LEAST_ROWS and not height.any():
-            yield Finding(
-                "warning", name, "height_m is zero in all rows", "the log holds no heights; give large sigma_u_m"
-            )
+            yield Finding(name, "height_m is zero in all rows", "the log holds no heights; give large sigma_u_m")
         elif not _HEIGHTS_M[0] < float(np.median(height)) < _HEIGHTS_M[1]:
             text = f"median height {np.median(height):.6g} m, where land lies between -430 and 8849 m"
-            yield Finding("warning", name, text, "give metres above the ellipsoid")
+            yield Finding(name, text, "give metres above the ellipsoid")
     gnss, control = facts.session.gnss, facts.session.control
     if gnss is None or control is None or len(gnss) < 2:
         return
@@ -109,9 +115,7 @@ def _heights(facts: Facts) -> Iterator[Finding]:
     frames = {facts.session.mount(name).frame for name in ("gnss", "control")}
     if _GEOID_M[0] < abs(middle) < _GEOID_M[1] and abs(middle) > 4.0 * spread and len(frames) == 1:
         text = f"heights lie {middle:+.1f} m off those of the control points, as the geoid does"
-        yield Finding(
-            "warning", "gnss", text, 'one of them is above sea level: declare it by frame = "msl" in [sensors]'
-        )
+        yield Finding("gnss", text, 'one of them is above sea level: declare it by frame = "msl" in [sensors]')
 
 
 def _frozen(facts: Facts) -> Iterator[Finding]:
@@ -127,7 +131,7 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
             if frozen and _moves(facts, stream.t_ns[[first, last]]):
                 at = float(facts.session.seconds(stream.t_ns[first]))
                 text = f"repeats one position for {seconds:.0f} s from {at:.1f} s on, while the inertial data move"
-                yield Finding("warning", name, text, "receiver output frozen; remove the repeated rows")
+                yield Finding(name, text, "receiver output frozen; remove the repeated rows")
 
 
 def _moves(facts: Facts, span: Times) -> bool:
@@ -155,9 +159,9 @@ def _velocities(facts: Facts) -> Iterator[Finding]:
     along = float(np.median((measured[:, :2] * motion[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
     turned = float(np.median((measured[:, [1, 0]] * motion[:, :2]).sum(axis=1) / np.maximum(length, 1e-9)))
     if along < -0.7:
-        yield Finding("warning", "gnss", "velocity points against the motion of the fixes", "flip its sign")
+        yield Finding("gnss", "velocity points against the motion of the fixes", "flip its sign")
     elif turned > 0.9 and along < 0.7:
-        yield Finding("warning", "gnss", "velocity fits the fixes with east and north exchanged", "exchange ve and vn")
+        yield Finding("gnss", "velocity fits the fixes with east and north exchanged", "exchange ve and vn")
 
 
 def _attitudes(facts: Facts) -> Iterator[Finding]:
@@ -187,13 +191,13 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
     best = min(off, key=lambda name: off[name])
     if best != "unchanged" and off["unchanged"] > 20.0 and off[best] < 0.25 * off["unchanged"]:
         text = f"attitudes turn {off['unchanged']:.0f} deg away from gyro, {off[best]:.1f} deg if read {best}"
-        yield Finding("warning", "pose_fixes", text, "give qw, qx, qy, qz of nav_R_body")
+        yield Finding("pose_fixes", text, "give qw, qx, qy, qz of nav_R_body")
         return
     up = interpolate(t_ns, slow.t_ns, slow.accel)
     vertical = float(np.median(Rotation.from_quat(readings["unchanged"]).apply(up)[:, 2]))
     if vertical < -0.5 * facts.session.gravity:
         text = f"attitudes turn specific force to {vertical:.1f} m/s^2 along up: they look like north, east, down"
-        yield Finding("warning", "pose_fixes", text, "give nav_R_body with nav = east, north, up")
+        yield Finding("pose_fixes", text, "give nav_R_body with nav = east, north, up")
 
 
 def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:

@@ -11,8 +11,7 @@ from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.so3 import exp, rotate
 from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, over_chords, repeats
-from smartnav_graph.session.health.units import odd_speed
+from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, odd_speed, over_chords, repeats
 
 _EARTH_UT = (22.0, 67.0)  # of the geomagnetic field at the ground
 _FIELD_UNITS = {1e-6: "tesla", 1e-3: "millitesla", 1e-2: "gauss", 1e1: "milligauss", 1e3: "nanotesla"}
@@ -36,25 +35,19 @@ def _field(facts: Facts) -> Iterator[Finding]:
     for factor, unit in _FIELD_UNITS.items():
         if low <= size / factor <= high:
             yield Finding(
-                "warning",
-                "magnetometer",
-                f"median |field| {size:.3g} uT, expected {near}: it looks like {unit}",
-                "give uT",
+                "magnetometer", f"median |field| {size:.3g} uT, expected {near}: it looks like {unit}", "give uT"
             )
             return
     if not 0.3 * low < size < 3.0 * high:
         text = f"median |field| {size:.4g} uT, expected {near}"
-        yield Finding("warning", "magnetometer", text, "calibrate its hard iron, or check the unit")
+        yield Finding("magnetometer", text, "calibrate its hard iron, or check the unit")
     yield from _field_direction(facts, size)
     for first, last in repeats(stream.field_ut):
         seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS
         if seconds >= _FROZEN_FIELD_S and last - first >= LEAST_ROWS:
             at = float(facts.session.seconds(stream.t_ns[first]))
             yield Finding(
-                "warning",
-                "magnetometer",
-                f"repeats one reading for {seconds:.0f} s from {at:.1f} s on",
-                "sensor output frozen",
+                "magnetometer", f"repeats one reading for {seconds:.0f} s from {at:.1f} s on", "sensor output frozen"
             )
             return
 
@@ -75,7 +68,7 @@ def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
         if abs(wanted) > 0.5 and abs(sine + wanted) < 0.2:
             found, dip = np.degrees(np.arcsin(sine)), np.degrees(np.arcsin(wanted))
             text = f"field points {found:+.0f} deg from the horizon, expected {dip:+.0f}"
-            yield Finding("warning", "magnetometer", f"{text}: its sign is wrong", "flip the sign of all axes")
+            yield Finding("magnetometer", f"{text}: its sign is wrong", "flip the sign of all axes")
             return
     yield from _field_turns(facts, t_ns, field)
 
@@ -99,10 +92,10 @@ def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
     correlation = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
     if correlation < -_CORRELATED:
         text = "field turns against gyro: its axes are mirrored or exchanged, or the sign of gyro is wrong"
-        yield Finding("warning", "magnetometer", text, "give the field in body axes, right-handed")
+        yield Finding("magnetometer", text, "give the field in body axes, right-handed")
     elif correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
-        yield Finding("warning", "imu", text, "multiply gyro by 180/pi")
+        yield Finding("imu", text, "multiply gyro by 180/pi")
 
 
 def _pressure(facts: Facts) -> Iterator[Finding]:
@@ -121,7 +114,7 @@ def _pressure(facts: Facts) -> Iterator[Finding]:
         unit = next((name for f, name in _PRESSURE_UNITS.items() if abs(median / f / centre - 1.0) < share), None)
         looks = f": it looks like {unit}" if unit else ""
         text = f"median pressure {median:.5g} hPa, expected {wanted}{looks}"
-        yield Finding("warning", "barometer", text, "give hPa" if unit else "check unit and [origin] height_m")
+        yield Finding("barometer", text, "give hPa" if unit else "check unit and [origin] height_m")
 
 
 def _temperature(facts: Facts) -> Iterator[Finding]:
@@ -131,7 +124,7 @@ def _temperature(facts: Facts) -> Iterator[Finding]:
     median = float(np.median(stream.temperature_c))
     if not -60.0 < median < 110.0:
         looks = ": it looks like kelvin" if 230.0 < median < 370.0 else ""
-        yield Finding("warning", "temperature", f"median {median:.4g} deg C{looks}", "give degrees Celsius")
+        yield Finding("temperature", f"median {median:.4g} deg C{looks}", "give degrees Celsius")
 
 
 def _speeds(facts: Facts) -> Iterator[Finding]:
@@ -153,19 +146,15 @@ def _speed(facts: Facts, where: str, what: str, t_ns: Times, size: Floats, along
     inside = None if chords is None else chords.clear & (chords.t_ns >= t_ns[0]) & (chords.t_ns <= t_ns[-1])
     if chords is None or inside is None or inside.sum() < LEAST_ROWS:
         if fastest > _MAX_SPEED:
-            yield Finding(
-                "warning", where, f"99 % quantile of {what} is {fastest:.4g} m/s, faster than any car", "give m/s"
-            )
+            yield Finding(where, f"99 % quantile of {what} is {fastest:.4g} m/s, faster than any car", "give m/s")
         return
     mean, way = (over_chords(chords, t_ns, values)[inside] for values in (np.abs(size), along))
     known = chords.speed[inside]
     yield from odd_speed(where, what, mean, known)
     if float(np.median(way / known)) < -0.3:
-        yield Finding(
-            "warning", where, f"{what} is backwards while the fixes move", "flip its sign, or correct [device] forward"
-        )
+        yield Finding(where, f"{what} is backwards while the fixes move", "flip its sign, or correct [device] forward")
     elif float(np.median(mean / known)) < 0.05:
-        yield Finding("warning", where, f"{what} is zero while the fixes move", f"remove {where}, or import it again")
+        yield Finding(where, f"{what} is zero while the fixes move", f"remove {where}, or import it again")
 
 
 def _standstills(facts: Facts) -> Iterator[Finding]:
@@ -184,7 +173,7 @@ def _standstills(facts: Facts) -> Iterator[Finding]:
         moving += bool(turned or went)
     if moving:
         text = f"the device moves in {count_of(moving, 'listed standstill')} of {len(stream)}"
-        yield Finding("warning", "static", text, "check their stamps; a false standstill bends the trajectory")
+        yield Finding("static", text, "check their stamps; a false standstill bends the trajectory")
 
 
 RULES = (_field, _pressure, _temperature, _speeds, _standstills)

@@ -18,31 +18,31 @@ def _rows(facts: Facts) -> Iterator[Finding]:
     session = facts.session
     for name, stream in session.streams().items():
         if not len(stream):
-            yield Finding("error", name, "has no rows", "remove the stream, or import the log again")
+            yield Finding(name, "has no rows", "remove the stream, or import the log again", "error")
     if session.imu is None:
-        yield Finding("error", "imu", "there is no inertial stream", "the IMU is required; import one")
+        yield Finding("imu", "there is no inertial stream", "the IMU is required; import one", "error")
     elif 0 < len(session.imu) < 2:
-        yield Finding("error", "imu", "has one row only", "import at least two")
+        yield Finding("imu", "has one row only", "import at least two", "error")
     elif len(session.imu) and (length := (session.imu.t_ns[-1] - session.imu.t_ns[0]) / NS) < 1.0:
-        yield Finding("warning", "imu", f"lasts {length:.3f} s only", "check the unit of its time stamps")
+        yield Finding("imu", f"lasts {length:.3f} s only", "check the unit of its time stamps")
     if not session.absolute():
         text = f"no absolute sensor ({', '.join(ABSOLUTE)})"
-        yield Finding("warning", "session", text, "start from a standstill or with --initial for dead reckoning")
+        yield Finding("session", text, "start from a standstill or with --initial for dead reckoning")
 
 
 def dropped(facts: Facts) -> Iterator[Finding]:
     for name, counts in facts.session.dropped.items():
-        yield Finding("info", name, ", ".join(f"{count} {reason}" for reason, count in counts.items()))
+        yield Finding(name, ", ".join(f"{count} {reason}" for reason, count in counts.items()), level="info")
 
 
 def _clock(facts: Facts) -> Iterator[Finding]:
     session = facts.session
     if session.clock_epoch == "unix" and not _UNIX_FROM <= session.t0_ns <= _UNIX_TO:
         text = f"epoch is unix, but time zero is {session.t0_ns} ns, outside 1990 to 2100"
-        yield Finding("warning", "session.toml [clock]", text, "check the unit of t_ns, or set another epoch")
+        yield Finding("session.toml [clock]", text, "check the unit of t_ns, or set another epoch")
     if facts.imu is not None and not 1.0 <= (rate := 1.0 / period(facts.imu)) <= 20_000.0:
         text = f"median rate {rate:.4g} Hz is outside 1 Hz to 20 kHz"
-        yield Finding("warning", "imu", text, "t_ns counts nanoseconds; check the unit of the time stamps")
+        yield Finding("imu", text, "t_ns counts nanoseconds; check the unit of the time stamps")
 
 
 def _constant(facts: Facts) -> Iterator[Finding]:
@@ -67,7 +67,7 @@ def _constant(facts: Facts) -> Iterator[Finding]:
             and not _resting(facts, stream)
         ):
             text = f"{what} is {' '.join(f'{x:g}' for x in np.atleast_1d(values[0]))} in all {len(values)} rows"
-            yield Finding(level, stream, text, f"if the sensor did not record, remove {stream} or import it again")
+            yield Finding(stream, text, f"if the sensor did not record, remove {stream} or import it again", level)
 
 
 def _resting(facts: Facts, stream: str) -> bool:
@@ -97,11 +97,11 @@ def _overlap(facts: Facts) -> Iterator[Finding]:
                 f"{len(stream) - count} of {len(stream)} rows lie outside the imu's span "
                 f"0 to {(last - first) / NS:.3f} s (the stream spans {begin:.3f} to {end:.3f} s)"
             )
-            yield Finding("warning", name, text, "they are not used; check that both use one clock")
+            yield Finding(name, text, "they are not used; check that both use one clock")
     absolute = [name for name in inside if name in ABSOLUTE]
     if absolute and not any(inside[name] for name in absolute):
         text = f"no row of {', '.join(absolute)} lies inside the imu's span 0 to {(last - first) / NS:.3f} s"
-        yield Finding("error", "session", text, "bring the stamps of both to one clock")
+        yield Finding("session", text, "bring the stamps of both to one clock", "error")
 
 
 RULES = (_rows, _clock, _constant, _overlap)

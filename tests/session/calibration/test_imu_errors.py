@@ -14,7 +14,6 @@ from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.session.calibration import model
-from smartnav_graph.session.calibration.apply import corrected
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, Calibration, ImuErrors
 
 ACCEL = (1.01, 0.002, -0.003, 0.001, 0.99, 0.004, 0.0, -0.002, 1.005)
@@ -40,7 +39,7 @@ def with_errors(session):
 
 def test_true_is_matrix_times_reading_less_bias():
     imu = sn.simulate("static-60s").imu
-    found = corrected(imu, ERRORS)
+    found = ERRORS.corrected(imu)
     row = np.reshape(ACCEL, (3, 3)) @ (imu.accel[7] - np.array(ERRORS.accel_bias))
     np.testing.assert_allclose(found.accel[7], row, rtol=1e-14)
     row = np.reshape(GYRO, (3, 3)) @ (imu.gyro[7] - np.array(ERRORS.gyro_bias))
@@ -50,7 +49,7 @@ def test_true_is_matrix_times_reading_less_bias():
 
 def test_nothing_known_changes_nothing():
     imu = sn.simulate("static-60s").imu
-    assert corrected(imu, ImuErrors()) is imu
+    assert ImuErrors().corrected(imu) is imu
 
 
 def test_a_calibrated_device_gives_the_solution_of_a_perfect_one(clean):
