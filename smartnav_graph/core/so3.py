@@ -7,9 +7,10 @@ Least-squares estimation of transformation parameters between two point patterns
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.timebase import seconds_since
 
 
 def skew(v: Floats) -> Floats:
@@ -47,6 +48,18 @@ def quaternion(R: Floats) -> Floats:
 def from_quaternion(q: Floats) -> Floats:
     """Rotation matrices (m, 3, 3) of quaternions (m, 4) w x y z of any norm but zero."""
     return np.asarray(Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix())
+
+
+def slerp(t_ns: Times, at_ns: Times, R: Floats) -> Floats:
+    """Rotation matrices (n, 3, 3) at `t_ns` (n,), interpolated between R (m, 3, 3) at `at_ns` (m,).
+
+    Outside the span the end values hold.
+    """
+    if len(R) == 1:
+        return np.repeat(R, len(t_ns), axis=0)
+    inside = np.clip(t_ns, at_ns[0], at_ns[-1])
+    t0 = int(at_ns[0])
+    return np.asarray(Slerp(seconds_since(at_ns, t0), Rotation.from_matrix(R))(seconds_since(inside, t0)).as_matrix())
 
 
 def left_jacobian_inverse(theta: Floats) -> Floats:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.so3 import best_rotation, from_quaternion
+from smartnav_graph.core.so3 import best_rotation, from_quaternion, slerp
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
@@ -36,14 +36,6 @@ class FrameAlignment:
         """Aligned positions (n, 3)."""
         return np.asarray(self.scale * rows @ self.R.T + self.t)
 
-    def vector(self, rows: Floats) -> Floats:
-        """Aligned velocities (n, 3)."""
-        return np.asarray(self.scale * rows @ self.R.T)
-
-    def rotation(self, rotations: Floats) -> Floats:
-        """Aligned attitudes (n, 3, 3)."""
-        return np.asarray(self.R @ rotations)
-
 
 @dataclass(frozen=True, kw_only=True)
 class StateSeries:
@@ -65,11 +57,8 @@ class StateSeries:
 
     def take(self, rows: Mask) -> StateSeries:
         """Only these rows."""
-
-        def part(values: Floats) -> Floats:
-            return values[rows]
-
-        return self._each(self.t_ns[rows], part, part)
+        known = {name: part for name, part in vars(self).items() if part is not None}
+        return StateSeries(**{name: part[rows] for name, part in known.items()})
 
     def inside(self, other: StateSeries) -> Mask:
         """Mask of the rows that lie within the span of `other`."""
@@ -78,31 +67,20 @@ class StateSeries:
     def at(self, t_ns: Times) -> StateSeries:
         """Interpolated: linear, attitude by slerp. Covariances linear too, which keeps them positive definite."""
 
-        def between(values: Floats) -> Floats:
+        def between(values: Floats | None) -> Floats | None:
+            if values is None:
+                return None
             flat = interpolate(t_ns, self.t_ns, values.reshape(len(self), -1))
             return flat.reshape(len(t_ns), *values.shape[1:])
 
-        return self._each(t_ns, between, lambda rotations: self._slerp(rotations, t_ns))
-
-    def _each(
-        self, t_ns: Times, change: Callable[[Floats], Floats], change_rotation: Callable[[Floats], Floats]
-    ) -> StateSeries:
         return StateSeries(
             t_ns=t_ns,
-            position=change(self.position),
-            rotation=None if self.rotation is None else change_rotation(self.rotation),
-            velocity=None if self.velocity is None else change(self.velocity),
-            covariance=None if self.covariance is None else change(self.covariance),
-            sigma=None if self.sigma is None else change(self.sigma),
+            position=interpolate(t_ns, self.t_ns, self.position),
+            rotation=None if self.rotation is None else slerp(t_ns, self.t_ns, self.rotation),
+            velocity=between(self.velocity),
+            covariance=between(self.covariance),
+            sigma=between(self.sigma),
         )
-
-    def _slerp(self, rotations: Floats, t_ns: Times) -> Floats:
-        if len(self) == 1:
-            return np.repeat(rotations, len(t_ns), axis=0)
-        t0 = int(self.t_ns[0])
-        own, wanted = seconds_since(self.t_ns, t0), seconds_since(t_ns, t0)
-        slerp = Slerp(own, Rotation.from_matrix(rotations))
-        return np.asarray(slerp(np.clip(wanted, own[0], own[-1])).as_matrix())
 
 
 def states_of_solution(solution: Solution) -> StateSeries:
@@ -223,7 +201,8 @@ def find_time_offset(solution: Solution, reference: Reference, method: str) -> f
         No candidate: the speeds do not vary and the spans do not overlap.
     """
     estimate, truth = states_of_solution(solution), states_of_reference(reference, 0)
-    step_s = _grid_step(estimate, truth)
+    periods = [float(np.median(np.diff(track.t_ns))) / NS for track in (estimate, truth) if len(track) > 1]
+    step_s = float(np.clip(max(periods, default=0.1), 0.05, 1.0))
     results = []
     for coarse in _candidates(estimate, truth, step_s):
         cost = _cost(estimate, truth, method, coarse, step_s)
@@ -234,11 +213,6 @@ def find_time_offset(solution: Solution, reference: Reference, method: str) -> f
         check_overlap(estimate, truth, solution.t0_ns, 0.0)
         raise SessionError("--time-offset auto", "the offset is not observable", remedy="give it in seconds")
     return min(results)[1]
-
-
-def _grid_step(estimate: StateSeries, truth: StateSeries) -> float:
-    periods = [float(np.median(np.diff(track.t_ns))) / NS for track in (estimate, truth) if len(track) > 1]
-    return float(np.clip(max(periods, default=0.1), 0.05, 1.0))
 
 
 def _speed(track: StateSeries, step_s: float) -> Floats:

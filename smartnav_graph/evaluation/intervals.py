@@ -114,11 +114,13 @@ def intervals(
     wrong = [spacing for spacing in every_s if not spacing > 0]
     if wrong:
         raise ConfigError("--every", f"{wrong[0]}", "spacings > 0 s")
+    config = config or Config()
+    config = replace(config, run=replace(config.run, rate="keyframes"))
     runs = [(spacing, seed) for spacing in every_s for seed in range(seeds if generated else 1)]
     for count, (spacing, seed) in enumerate(runs, 1):
         fixed = with_fixes(session, reference, spacing, generated, seed) if generated else _thinned(session, spacing)
         watch = under(f"run {count} of {len(runs)}", progress)
-        run = replay(fixed, _at_keyframes(config or Config()), progress=watch)
+        run = replay(fixed, config, progress=watch)
         yield from _scored(run, reference, spacing, seed, bool(generated))
 
 
@@ -183,17 +185,13 @@ def _fix_times(session: Session) -> Times:
     return np.unique(np.concatenate([np.zeros(0, np.int64), *stamps]))
 
 
-def _at_keyframes(config: Config) -> Config:
-    return replace(config, run=replace(config.run, rate="keyframes"))
-
-
 def _scored(run: Run, reference: Reference, every_s: float, seed: int, generated: bool) -> Iterator[Interval]:
     """The three rows of one replay."""
     sensor = ReferencePoint.of(run) if generated else ReferencePoint()
     times = _fix_times(run.session)
     between = (reference.t_ns > times[0]) & (reference.t_ns < times[-1]) & ~np.isin(reference.t_ns, times)
     rows = reference.take(between & (reference.t_ns <= run.solution.t_ns[-1]))
-    ends = _arrivals(run.session)
+    ends = np.unique(np.concatenate([stream.available_ns for stream in run.session.absolute().values()]))
     ends = ends[(ends > times[0]) & (ends <= run.solution.t_ns[-1])]
     last = np.searchsorted(reference.t_ns, ends, side="right") - 1
     last = last[(last >= 0) & (reference.t_ns[last] > ends - NEAR_S * NS)]
@@ -204,11 +202,6 @@ def _scored(run: Run, reference: Reference, every_s: float, seed: int, generated
             raise SessionError("reference", f"has no row for {kind} between the fixes", "one clock for both")
         found = sensor.smoothed(run, truth.t_ns) if kind == "smoothed" else sensor.causal(run, truth.t_ns)
         yield Interval.of(every_s, kind, seed, found - truth.enu)
-
-
-def _arrivals(session: Session) -> Times:
-    """When the fixes became available, each time once."""
-    return np.unique(np.concatenate([stream.available_ns for stream in session.absolute().values()]))
 
 
 @dataclass(frozen=True)

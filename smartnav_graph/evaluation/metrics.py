@@ -5,7 +5,8 @@ APE = |p_est - p_ref| after alignment; rotation = geodesic angle of R_ref^T R_es
 without, the difference of the two displacements. NEES: see `_consistency`; an alignment fitted to the reference makes
 every NEES a little too small.
 
-Source: Sturm et al. (2012), A Benchmark for the Evaluation of RGB-D SLAM Systems, section IV (APE, RPE).
+Source: Sturm et al. (2012), A Benchmark for the Evaluation of RGB-D SLAM Systems, section IV (APE, RPE); Bar-Shalom,
+Li, Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, section 5.4 (NEES).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.so3 import log, rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.evaluation.align import (
@@ -30,7 +31,6 @@ from smartnav_graph.evaluation.align import (
     states_of_reference,
     states_of_solution,
 )
-from smartnav_graph.evaluation.consistency import nees
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
 
@@ -183,8 +183,8 @@ def aligned(states: StateSeries, alignment: FrameAlignment) -> StateSeries:
     return StateSeries(
         t_ns=states.t_ns,
         position=alignment.position(states.position),
-        rotation=alignment.rotation(states.rotation),
-        velocity=alignment.vector(states.velocity),
+        rotation=alignment.R @ states.rotation,
+        velocity=alignment.scale * states.velocity @ alignment.R.T,
         covariance=J @ states.covariance @ J.T,
     )
 
@@ -269,6 +269,30 @@ def _consistency(estimate: StateSeries, truth: StateSeries) -> tuple[dict[str, f
         else:
             averages[name] = float(values.mean())
     return averages, tuple(notes)
+
+
+def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
+    """Normalised estimation error squared, e^T P^-1 e, of every row.
+
+    Expected value k (the dimension) where the covariance is right; a larger mean means that it is too small.
+
+    Parameters
+    ----------
+    errors : (n, k)
+    covariances : (n, k, k), same units squared
+
+    Returns
+    -------
+    (n,) dimensionless; NaN where the covariance is not finite or not positive definite.
+    """
+    e = np.asarray(errors, dtype=np.float64)
+    P = np.asarray(covariances, dtype=np.float64)
+    out = np.full(len(e), np.nan)
+    good: Mask = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    # eigvalsh finds indefinite matrices without raising for the whole stack, as a Cholesky would
+    good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
+    out[good] = np.einsum("ni,ni->n", e[good], np.linalg.solve(P[good], e[good][:, :, None])[:, :, 0])
+    return out
 
 
 def _at_common_epochs(estimate: StateSeries, truth: StateSeries) -> tuple[StateSeries, StateSeries]:

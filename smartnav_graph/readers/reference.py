@@ -134,17 +134,12 @@ def _named(table: TextTable, time: str) -> Table:
     lower = TextTable(table.path, {name.lower(): cells for name, cells in table.cells.items()})
     wanted = ("e_m", "n_m", "u_m") if "e_m" in lower.cells else _POSITION
     lower.require(wanted)
-    known = {name for spec in Reference.specs() for name in spec.metadata["columns"]} - {"t_ns", "e_m", "n_m", "u_m"}
-    columns = {"t_ns": _named_times(lower, time)} | vector_columns("{}_m", lower.floats(*wanted), "enu")
-    return columns | {name: lower.floats(name) for name in lower.cells if name in known and not lower.is_empty(name)}
-
-
-def _named_times(table: TextTable, name: str) -> Times:
-    unit = _TIME_UNITS[name]
-    if unit == NS and np.abs(table.floats(name)).max() > _LARGEST_S:
-        found = f"{name} begins with {table.texts(name)[0]}"
+    if _TIME_UNITS[time] == NS and np.abs(lower.floats(time)).max() > _LARGEST_S:
+        found = f"{time} begins with {lower.texts(time)[0]}"
         raise SessionError(table.path, found, "seconds", "call the column t_ns if it counts nanoseconds")
-    return table.times(name, unit)
+    known = {name for spec in Reference.specs() for name in spec.metadata["columns"]} - {"t_ns", "e_m", "n_m", "u_m"}
+    columns = {"t_ns": lower.times(time, _TIME_UNITS[time])} | vector_columns("{}_m", lower.floats(*wanted), "enu")
+    return columns | {name: lower.floats(name) for name in lower.cells if name in known and not lower.is_empty(name)}
 
 
 def _kitti(path: Path, times: str | Path | None, body_T_ref: str | Path | None) -> Table:
@@ -161,15 +156,11 @@ def _kitti(path: Path, times: str | Path | None, body_T_ref: str | Path | None) 
         raise SessionError(
             times, f"has {len(clock)} rows", f"{len(rows)}, as many as {path}", "give the file beside it"
         )
-    poses = _homogeneous(rows.floats(*rows.cells).reshape(-1, 3, 4))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.floats(*rows.cells).reshape(-1, 3, 4)
     _check_rotations(path, poses)
     body_T_cam = load_transform(body_T_ref)
     return {"t_ns": clock.times("t")} | _columns_of(body_T_cam @ poses @ np.linalg.inv(body_T_cam))
-
-
-def _homogeneous(rows: Floats) -> Floats:
-    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
-    return np.concatenate([rows, bottom], axis=1)
 
 
 def _of_body(path: Path, columns: Table, body_T_ref: Floats) -> Table:

@@ -27,13 +27,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
-from smartnav_graph.core.so3 import quaternion
-from smartnav_graph.core.timebase import interpolate, nearest, ns_from_seconds, ns_from_text, seconds_since
+from smartnav_graph.core.so3 import from_quaternion, quaternion, slerp
+from smartnav_graph.core.timebase import interpolate, nearest, ns_from_seconds, ns_from_text
 from smartnav_graph.readers.matlab import read_mat
 from smartnav_graph.readers.source import Reader, build_session, inertial_columns, vector_columns
 from smartnav_graph.readers.text import first_lines, read_bytes, read_text
@@ -207,11 +206,9 @@ def _own_attitude(folder: Path, system: System, t_ns: Times) -> Table:
         return {}
     table = read_text(file, names=("t", *system.quaternion))
     at_ns = table.times("t")
-    rotations = Rotation.from_quat(table.floats("qx", "qy", "qz", "qw"))
     inside = (t_ns >= at_ns[0]) & (t_ns <= at_ns[-1])
-    there = Slerp(seconds_since(at_ns, int(at_ns[0])), rotations)(seconds_since(t_ns[inside], int(at_ns[0])))
     rows = np.full((len(t_ns), 4), np.nan)
-    rows[inside] = there.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    rows[inside] = quaternion(slerp(t_ns[inside], at_ns, from_quaternion(table.floats("qw", "qx", "qy", "qz"))))
     return vector_columns("system_q{}", rows, "wxyz")
 
 

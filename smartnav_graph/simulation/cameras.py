@@ -25,6 +25,7 @@ from smartnav_graph.core.so3 import exp, rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Mount
+from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import Images, Matches, Tracks
 from smartnav_graph.simulation.scenes import Scene
 from smartnav_graph.simulation.trajectory import Trajectory
@@ -129,28 +130,20 @@ class Projection(NamedTuple):
     xy_px: Floats
 
 
-@dataclass(frozen=True)
-class Taken:
-    """The streams of one camera."""
-
-    images: Images
-    matches: Matches | None
-    tracks: Tracks | None
-
-
 def take(
     model: SimulatedCamera, trajectory: Trajectory, t_ns: Times, t: Floats, scene: Scene, rng: np.random.Generator
-) -> Taken:
-    """Images at the stamps t_ns (n,), at times t (n,) s of the trajectory, and the features in them."""
+) -> dict[str, Stream | None]:
+    """Images at the stamps t_ns (n,), at times t (n,) s of the trajectory, and the features in them, by stream."""
     images = _images(model, t_ns)
     if not (model.pairs or model.tracked):
-        return Taken(images, None, None)
+        return {"images": images}
     views = [project(model, trajectory, scene, float(at)) for at in t]
     jumps = _jumps(model, t, rng)
     blind = _blind(model, t)
     views = [Projection(v.rows[:0], v.xy_px[:0]) if dark else v for v, dark in zip(views, blind, strict=True)]
     matches = _matches(model, views, jumps, t_ns, rng) if model.pairs else None
-    return Taken(images, matches, _tracks(model, views, jumps, t_ns, rng) if model.tracked else None)
+    tracks = _tracks(model, views, jumps, t_ns, rng) if model.tracked else None
+    return {"images": images, "matches": matches, "tracks": tracks}
 
 
 def file_name(image_id: int) -> str:

@@ -1,4 +1,5 @@
-"""Position fixes and their errors: white noise, Gauss-Markov process, outliers, outages; pose fixes; control points.
+"""Position fixes and their errors: white noise, Gauss-Markov process, outliers, outages; pose fixes; control points;
+ranges to anchors: white noise, a bias for each anchor, detours of radio waves.
 
 Horizontal sigmas are per axis; the vertical ones are 1.5 times as large.
 """
@@ -15,11 +16,13 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.so3 import exp, quaternion, rotate
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix
+from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Ranges
 from smartnav_graph.simulation.trajectory import Truth
 
 AXES = np.array([1.0, 1.0, 1.5])
 BURST_S = (4.0, 9.0)
+# Corners of a hall, two metres and more over the device.
+HALL = ((-16.0, -8.0, 2.0), (5.0, -8.0, 3.0), (5.0, 8.0, 2.0), (-16.0, 8.0, 3.0))
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,20 @@ class PoseFixModel:
     sigma_m: float = 0.3
     sigma_rad: float = 0.035
     latency_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class RangeModel:
+    """Two-way ranging at `rate_hz` with all `anchors` (e, n, u m) at once: white noise and bias of an anchor, sigma m;
+    a share of `detours` is longer by `detour_m` (least, most)."""
+
+    anchors: tuple[tuple[float, float, float], ...] = HALL
+    rate_hz: float = 2.0
+    sigma_m: float = 0.1
+    bias_sigma_m: float = 0.2
+    detours: float = 0.0
+    detour_m: tuple[float, float] = (2.0, 8.0)
+    body_t_sensor: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def white(n: int, sigma: float, rng: np.random.Generator) -> Floats:
@@ -186,3 +203,25 @@ def control(
     enu = truth.nav_t_body + sigma_m * rng.standard_normal((n, 3))
     sigma = np.full((n, 3), sigma_m)
     return ControlPoint(t_ns=t_ns, lla=frame.lla_from_nav(enu), point_id=np.array(names, dtype=object), sigma=sigma)
+
+
+def ranges(truth: Truth, t_ns: Times, model: RangeModel, frame: LocalFrame, rng: np.random.Generator) -> Ranges:
+    """Ranges at `truth`, one row an epoch and anchor. Column `is_outlier` (kept in `extra`) marks detours with 1."""
+    anchors, n = np.array(model.anchors), len(model.anchors)
+    bias = model.bias_sigma_m * rng.standard_normal(n)
+    sensor = truth.nav_t_body + truth.nav_R_body @ np.asarray(model.body_t_sensor)
+    distance = np.linalg.norm(sensor[:, None] - anchors, axis=2)
+    detour = rng.random(distance.shape) < model.detours
+    error = (
+        bias
+        + model.sigma_m * rng.standard_normal(distance.shape)
+        + detour * rng.uniform(*model.detour_m, distance.shape)
+    )
+    return Ranges(
+        t_ns=np.repeat(t_ns, n),
+        anchor_id=np.tile(np.array([f"A{i}" for i in range(n)], dtype=object), len(t_ns)),
+        range_m=np.maximum(distance + error, 0.0).ravel(),
+        sigma=np.full(distance.size, model.sigma_m),
+        lla=np.tile(frame.lla_from_nav(anchors), (len(t_ns), 1)),
+        extra={"is_outlier": detour.ravel().astype(np.int64)} if model.detours else {},
+    )

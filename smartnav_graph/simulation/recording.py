@@ -31,10 +31,9 @@ from smartnav_graph.session.calibration.model import (
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Ranges, Reference, StaticPeriod
-from smartnav_graph.simulation import cameras, fixes, ranges, render, sensors
+from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import SimulatedCamera
-from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
-from smartnav_graph.simulation.ranges import RangeModel
+from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
 from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
 
@@ -175,7 +174,7 @@ def _ranges(motion: _Motion, model: RangeModel | None) -> Ranges | None:
     if model is None:
         return None
     every = motion.rows(model.rate_hz)
-    return ranges.ranges(motion.truth.take(every), motion.t_ns[every], model, motion.frame, motion.rng("ranges"))
+    return fixes.ranges(motion.truth.take(every), motion.t_ns[every], model, motion.frame, motion.rng("ranges"))
 
 
 def _camera(motion: _Motion, model: SimulatedCamera | None) -> dict[str, Stream | None]:
@@ -183,8 +182,7 @@ def _camera(motion: _Motion, model: SimulatedCamera | None) -> dict[str, Stream 
         return {}
     scene, every = model.scene(motion.rng("scene")), motion.rows(model.rate_hz)
     t_ns, t = motion.t_ns[every], motion.t[every]
-    taken = cameras.take(model, motion.trajectory, t_ns, t, scene, motion.rng("camera"))
-    return {"images": taken.images, "matches": taken.matches, "tracks": taken.tracks}
+    return cameras.take(model, motion.trajectory, t_ns, t, scene, motion.rng("camera"))
 
 
 def simulate_to_folder(

@@ -22,8 +22,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.cameras import LOOKING_AHEAD, Faults, PictureModel, SimulatedCamera
-from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel
-from smartnav_graph.simulation.ranges import RangeModel
+from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
 from smartnav_graph.simulation.recording import Scenario
 from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel

@@ -13,16 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.progress import Progress, silent, under
-from smartnav_graph.core.so3 import rotate
-from smartnav_graph.core.timebase import NS, interpolate, seconds_since
+from smartnav_graph.core.so3 import from_quaternion, rotate, slerp
+from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Matches, Reference
+from smartnav_graph.session.streams import Matches
 from smartnav_graph.vision.epipolar import rays, sampson
 from smartnav_graph.vision.front_end import FrontEndConfig, run_front_end
 
@@ -103,7 +102,8 @@ class CameraPoses:
         offset = 0 if session.calibration is None else session.calibration.cameras[camera].time_offset_s
         times = np.asarray(t_ns + round(offset * NS), dtype=np.int64)
         known = (times >= reference.t_ns[0]) & (times <= reference.t_ns[-1])
-        R, t = _poses(reference, np.clip(times, reference.t_ns[0], reference.t_ns[-1]))
+        R = slerp(times, reference.t_ns, from_quaternion(reference.quat))
+        t = interpolate(times, reference.t_ns, reference.enu)
         mount = session.mount(camera)
         return cls(R @ np.array(mount.body_R), t + R @ np.array(mount.body_t), known)
 
@@ -112,14 +112,6 @@ class CameraPoses:
         back = self.nav_R_cam[first].transpose(0, 2, 1)
         apart = self.nav_t_cam[second] - self.nav_t_cam[first]
         return back @ self.nav_R_cam[second], rotate(back, apart)
-
-
-def _poses(reference: Reference, t_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    assert reference.quat is not None
-    seconds = seconds_since(reference.t_ns, int(reference.t_ns[0]))
-    turn = Slerp(seconds, Rotation.from_quat(reference.quat[:, [1, 2, 3, 0]]))
-    at = np.clip(seconds_since(t_ns, int(reference.t_ns[0])), 0.0, seconds[-1])
-    return turn(at).as_matrix(), interpolate(t_ns, reference.t_ns, reference.enu)
 
 
 def true_matches(R: Floats, t: Floats, x0: Floats, x1: Floats, focal_px: float) -> tuple[Mask, Mask]:
@@ -155,7 +147,8 @@ def score_features(session: Session, config: FrontEndConfig, *, workers: int = 0
     found = run_front_end(session, config, workers=workers, progress=progress)
     assert found.matches is not None
     good, weak, known = _classified(session, found.matches)
-    pair = _pair_numbers(found.matches)
+    both = np.stack([found.matches.image_id_0, found.matches.image_id_1], axis=1)
+    pair = np.unique(both, axis=0, return_inverse=True)[1].ravel()
     scored = np.unique(pair[known])
     if not len(scored):
         where = session.path or "session"
@@ -206,11 +199,6 @@ def _classified(session: Session, matches: Matches) -> tuple[Mask, Mask, Mask]:
         good[rows], weak[rows] = true_matches(R, t, matches.xy0_n[rows], matches.xy1_n[rows], focal)
         known[rows] = poses.known[: len(rows)] & poses.known[len(rows) :]
     return good, weak, known
-
-
-def _pair_numbers(matches: Matches) -> NDArray[np.intp]:
-    both = np.stack([matches.image_id_0, matches.image_id_1], axis=1)
-    return np.asarray(np.unique(both, axis=0, return_inverse=True)[1]).ravel()
 
 
 def compare_features(

@@ -26,7 +26,6 @@ from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Matches, Tracks
 from smartnav_graph.vision import features, images, matching
 from smartnav_graph.vision.features import Features
-from smartnav_graph.vision.front_end_report import FrontEndReport
 from smartnav_graph.vision.images import OpenedPicture, Picture
 from smartnav_graph.vision.matching import Pairing
 from smartnav_graph.vision.parallel import ordered, threads
@@ -82,6 +81,64 @@ class FrontEndConfig:
     def rate(self) -> float:
         """Pictures a second at most; 0 for all."""
         return self.rate_hz if self.rate_hz is not None else 0.0 if self.tracks else RATE_HZ
+
+
+@dataclass(frozen=True)
+class FrontEndReport:
+    """Counts of pictures, pairs, matches and tracks.
+
+    pictures : of the session; thinned : left out to keep the rate; used : the rest without the skipped, which are
+    counted by reason, `first` naming a file of each; longest_break_s : between used pictures
+    pairs, empty_pairs (without a match), matches, median_matches of a pair; tracks, median_track_length in pictures,
+    lost_at_once (corners not found again), blind (steps that the gyroscope did not predict)
+    ms_picture, ms_pair : processor time of points and descriptors, and of matching; seconds : total
+    """
+
+    features: str
+    policy: str
+    pictures: int
+    thinned: int
+    used: int
+    skipped: Mapping[str, int]
+    first: Mapping[str, str]
+    longest_break_s: float
+    pairs: int = 0
+    empty_pairs: int = 0
+    matches: int = 0
+    median_matches: float = 0.0
+    tracks: int = 0
+    median_track_length: float = 0.0
+    lost_at_once: int = 0
+    blind: int = 0
+    ms_picture: float = 0.0
+    ms_pair: float = 0.0
+    seconds: float = 0.0
+
+    @property
+    def left_out(self) -> str:
+        """How many pictures were skipped, why, and one of each."""
+        return "; ".join(f"{n} {reason} (first: {self.first[reason]})" for reason, n in self.skipped.items()) or "none"
+
+    def to_text(self) -> str:
+        """A few lines for people."""
+        lines = [
+            f"pictures: {self.used} of {self.pictures} used, {self.thinned} left out to keep the rate; "
+            f"longest break {self.longest_break_s:.2f} s",
+            f"skipped: {self.left_out}",
+        ]
+        if self.tracks:
+            lines += [
+                f"tracks: {self.tracks}, median length {self.median_track_length:g} pictures; "
+                f"{self.lost_at_once} corners not found again; {self.blind} steps without a gyroscope",
+                f"time: {self.ms_picture:.1f} ms a picture",
+            ]
+        if self.pairs:
+            lines += [
+                f"pairs: {self.pairs}, {self.empty_pairs} without a match; {self.matches} matches, "
+                f"median {self.median_matches:g} a pair",
+                f"time: {self.ms_picture:.1f} ms a picture, {self.ms_pair:.1f} ms a pair",
+            ]
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -172,14 +172,12 @@ class PictureChecker:
         return REPEATED if repeated else BLURRED if blurred else ""
 
 
-def longest_break_s(found: Iterable[Picture], used: Iterable[Picture]) -> float:
+def longest_break_s(found: Sequence[Picture], used: Iterable[Picture]) -> float:
     """Longest time, s, between used pictures of one camera, the recording's ends included."""
     usable = {(picture.camera, picture.t_ns) for picture in used}
-    stamps: dict[str, list[int]] = {}
-    ends: dict[str, list[int]] = {}
-    for picture in found:
-        ends.setdefault(picture.camera, []).append(picture.t_ns)
-        if (picture.camera, picture.t_ns) in usable:
-            stamps.setdefault(picture.camera, []).append(picture.t_ns)
-    breaks = [np.diff([all_[0], *stamps.get(camera, []), all_[-1]]).max() for camera, all_ in ends.items()]
-    return float(max(breaks, default=0)) / NS
+    longest = 0
+    for camera in {picture.camera for picture in found}:
+        stamps = [picture.t_ns for picture in found if picture.camera == camera]
+        kept = [t_ns for t_ns in stamps if (camera, t_ns) in usable]
+        longest = max(longest, int(np.diff([stamps[0], *kept, stamps[-1]]).max()))
+    return longest / NS

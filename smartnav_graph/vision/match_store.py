@@ -22,8 +22,13 @@ from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.vision import images
-from smartnav_graph.vision.front_end import FrontEndConfig, FrontEndResult, result_options, run_front_end
-from smartnav_graph.vision.front_end_report import FrontEndReport
+from smartnav_graph.vision.front_end import (
+    FrontEndConfig,
+    FrontEndReport,
+    FrontEndResult,
+    result_options,
+    run_front_end,
+)
 from smartnav_graph.vision.parallel import ordered, threads
 
 SAME = "the same options, pictures and calibration"

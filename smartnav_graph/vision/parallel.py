@@ -20,7 +20,8 @@ def threads(count: int = 0) -> Iterator[Executor]:
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    executor = ThreadPoolExecutor(count or _processors())
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    executor = ThreadPoolExecutor(count or usable)
     try:
         yield executor
     finally:
@@ -39,8 +40,3 @@ def ordered(
             yield pending.popleft().result()
     while pending:
         yield pending.popleft().result()
-
-
-def _processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

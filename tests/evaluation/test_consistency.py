@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from differences import average_nees_bounds, chi2_bounds
 
-from smartnav_graph.evaluation.consistency import nees
+from smartnav_graph.evaluation.metrics import nees
 
 
 def test_nees_is_the_squared_error_over_the_variance():

@@ -14,13 +14,13 @@ import smartnav_graph as sn
 from smartnav_graph.core import frames
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.estimate.alignment.multilateration import multilaterate
-from smartnav_graph.evaluation.consistency import nees
+from smartnav_graph.evaluation.metrics import nees
 from smartnav_graph.factors.ranging import AnchorRange, RangeConfig
 from smartnav_graph.readers import load
 from smartnav_graph.session.calibration.model import Calibration, RangeNoise
 from smartnav_graph.session.session import Session
 from smartnav_graph.simulation import motions
-from smartnav_graph.simulation.ranges import RangeModel
+from smartnav_graph.simulation.fixes import RangeModel
 from smartnav_graph.simulation.recording import Scenario
 
 # A walk of a minute goes east and south, up to 60 m; anchors of one height would hardly tell that of the walker.

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sessions import on_control, positions, recorded, truth, with_gnss
 
 import smartnav_graph as sn
-from smartnav_graph.evaluation.consistency import nees
+from smartnav_graph.evaluation.metrics import nees
 from smartnav_graph.session.session import Session
 from smartnav_graph.simulation import motions
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel

@@ -77,7 +77,8 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
     """
     system = _LinearSystem(influence)
     index = int(influence.keyframes.index[place])
-    columns, turn = system.columns(index), _to_nav(influence.keyframes.nav_R_body[place])
+    columns, turn = system.columns(index), np.eye(15)
+    turn[:3, :3] = turn[3:6, 3:6] = influence.keyframes.nav_R_body[place]  # from body to nav axes
     covariances = _determined(system, columns, index)
     covariance = turn @ covariances[columns] @ turn.T
     variance = np.diag(covariance)
@@ -112,7 +113,7 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
 def _determined(system: _LinearSystem, columns: NDArray[np.int64], index: int) -> Floats:
     """Columns (n, 15) of the covariance, checked."""
     try:
-        found = system.covariances(columns)
+        found = _covariances(system.J, columns, 0.0)
     except RuntimeError:  # exactly singular
         found = np.full((system.J.shape[1], 15), np.nan)
     variance = np.diag(found[columns])
@@ -178,10 +179,6 @@ class _LinearSystem:
         touched = np.concatenate(touches)
         return touched, touched & np.concatenate(alone)
 
-    def covariances(self, columns: NDArray[np.int64]) -> Floats:
-        """Columns (n, c) of the covariance of all states."""
-        return _covariances(self.J, columns, 0.0)
-
     def sigma_without(self, source: int, columns: NDArray[np.int64], turn: Floats) -> Floats:
         """Sigma (15,) in nav axes without one source, inf where it is then not determined."""
         others = self.J[self.source[self.factor] != source]
@@ -200,13 +197,6 @@ def _first_columns(names: NDArray[np.uint64]) -> dict[int, int]:
 
 def _summing(label: NDArray[np.intp]) -> csr_matrix:
     return csr_matrix((np.ones(len(label)), (label, np.arange(len(label)))))
-
-
-def _to_nav(nav_R_body: Floats) -> Floats:
-    """(15, 15): the pose part from body to nav axes."""
-    turn = np.eye(15)
-    turn[:3, :3] = turn[3:6, 3:6] = nav_R_body
-    return turn
 
 
 def _covariances(J: csr_matrix, columns: NDArray[np.int64], ridge: float) -> Floats:

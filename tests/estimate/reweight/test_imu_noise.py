@@ -16,7 +16,7 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
 from smartnav_graph.estimate.reweight.imu_noise import MOST, NOISE_NAMES, WIDEST, Component, components
-from smartnav_graph.evaluation.consistency import nees
+from smartnav_graph.evaluation.metrics import nees
 from smartnav_graph.factors.imu import CALIBRATED_WEIGHT, CLASS_WEIGHT, ImuBuilder, ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
 from smartnav_graph.graph.pass_state import PassState
