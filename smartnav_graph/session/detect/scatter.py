@@ -1,0 +1,72 @@
+"""Scatter of position fixes by themselves: each against the cubic through its four neighbours.
+
+A cubic follows the motion over a few fixes, and every correlated error that is slower than these: what is left is the
+white part of the fixes and the motion that no cubic follows. With weights w_j of the cubic at the fix,
+
+    r = p - sum_j w_j p_j        var r = sigma^2 (1 + sum_j w_j^2)
+
+and the median of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
+leaves the same sigma, motion a larger one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.timebase import NS
+
+LEAST_FIXES = 12
+# Growth of the scatter at twice the spacing below which it is noise, not motion.
+NOISE_GROWTH = 1.5
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Standard deviation (m) of the white part of one component, and whether it is noise: otherwise it holds motion
+    and is an upper bound. rows : fixes that it was found from."""
+
+    sigma: float
+    is_noise: bool
+    rows: int
+
+
+def normalised_residuals(t_ns: Times, position: Floats, spacing: int = 1) -> Floats:
+    """Fixes less the cubic through the neighbours `spacing` and twice `spacing` rows before and after, over the square
+    root of 1 + sum w^2 (n, d); NaN where there are none. t_ns (n,) increasing, position (n, d) m."""
+    out = np.full(position.shape, np.nan)
+    middle = np.arange(2 * spacing, len(t_ns) - 2 * spacing)
+    if not len(middle):
+        return out
+    around = middle[:, None] + spacing * np.array([-2, -1, 1, 2])
+    t = (t_ns[around] - t_ns[middle][:, None]) / NS
+    weights = np.ones(t.shape)
+    for j in range(4):
+        for k in range(4):
+            if k != j:
+                weights[:, j] *= t[:, k] / (t[:, k] - t[:, j])
+    residual = position[middle] - np.einsum("nj,njd->nd", weights, position[around])
+    out[middle] = residual / np.sqrt(1.0 + (weights**2).sum(axis=1, keepdims=True))
+    return out
+
+
+def scatter(t_ns: Times, position: Floats) -> Scatter | None:
+    """Scatter of fixes (n, d), m; None where there are too few. Rows with the same stamp or position as the row before
+    are one fix."""
+    finite = np.isfinite(position).all(axis=1)
+    t_ns, position = t_ns[finite], position[finite]
+    new = np.concatenate([[True], (np.diff(t_ns) > 0) & np.diff(position, axis=0).any(axis=1)])[: len(t_ns)]
+    t_ns, position = t_ns[new], position[new]
+    if len(t_ns) < LEAST_FIXES:
+        return None
+    sigma, twice = (_sigma(normalised_residuals(t_ns, position, spacing)) for spacing in (1, 2))
+    return Scatter(sigma, twice < NOISE_GROWTH * sigma, len(t_ns))
+
+
+def _sigma(residual: Floats) -> float:
+    square = (residual**2).sum(axis=1)
+    dim = residual.shape[1]
+    return float(np.sqrt(np.median(square[np.isfinite(square)]) / chi2(dim).median()))

@@ -1,0 +1,58 @@
+"""The scatter of fixes is that of their white noise, and an upper bound where they move."""
+
+import numpy as np
+import pytest
+
+from smartnav_graph.session.detect.scatter import LEAST_FIXES, normalised_residuals, scatter
+
+NS = 10**9
+
+
+def stamps(n: int, step_s: float = 1.0) -> np.ndarray:
+    return (np.arange(n) * step_s * NS).astype(np.int64)
+
+
+def test_a_cubic_leaves_nothing() -> None:
+    t_ns = np.sort(np.random.default_rng(0).integers(0, 60 * NS, 40))
+    t = t_ns / NS
+    position = np.stack([1 + 2 * t - 0.3 * t**2 + 0.01 * t**3, 5 - t], axis=1)
+    left = normalised_residuals(t_ns, position)
+    assert np.nanmax(np.abs(left)) < 1e-6
+    assert np.isnan(left[[0, 1, -2, -1]]).all()
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_white_noise_is_found_whatever_the_speed_and_outliers(dim: int) -> None:
+    rng = np.random.default_rng(1)
+    t_ns = stamps(400)
+    position = 12.0 * (t_ns / NS)[:, None] + rng.normal(0.0, 2.5, (400, dim))
+    position[rng.choice(400, 20, replace=False)] += 300.0
+    found = scatter(t_ns, position)
+    assert found is not None and found.is_noise
+    assert 0.85 * 2.5 < found.sigma < 1.45 * 2.5
+
+
+def test_motion_is_no_noise() -> None:
+    t = np.arange(300.0)
+    position = np.stack([20 * np.sin(0.9 * t), 20 * np.cos(0.9 * t)], axis=1)
+    found = scatter(stamps(300), position + np.random.default_rng(2).normal(0.0, 0.02, position.shape))
+    assert found is not None and not found.is_noise and found.sigma > 0.02
+
+
+def test_slow_errors_do_not_show() -> None:
+    rng = np.random.default_rng(3)
+    slow = np.zeros((600, 2))
+    for k in range(1, 600):
+        slow[k] = np.exp(-1 / 60) * slow[k - 1] + rng.normal(0.0, 4.0 * np.sqrt(1 - np.exp(-2 / 60)), 2)
+    found = scatter(stamps(600), slow + rng.normal(0.0, 3.0, slow.shape))
+    assert found is not None and found.is_noise and 2.5 < found.sigma < 3.6
+
+
+def test_repeated_and_few_fixes() -> None:
+    rng = np.random.default_rng(4)
+    position = rng.normal(0.0, 1.0, (50, 2))
+    once = scatter(stamps(50), position)
+    twice = scatter(stamps(100, 0.5), np.repeat(position, 2, axis=0))
+    assert once is not None and twice is not None and once.rows == twice.rows == 50
+    assert scatter(stamps(LEAST_FIXES - 1), position[: LEAST_FIXES - 1]) is None
+    assert scatter(stamps(0), np.zeros((0, 2))) is None
