@@ -78,8 +78,8 @@ def evaluation_text(found: Evaluation) -> str:
         if row.translation_m is not None:
             turn = "" if row.rotation_deg is None else f", {row.rotation_deg:.3f} deg"
             lines.append(f"over {row.delta_s:g} s{'':<4}{row.translation_m:.3f} m{turn} ({row.pairs} pairs)")
-    nees = ", ".join(f"{k} {v:.2f}" for k, v in found.nees.items() if v is not None)
-    lines += [f"NEES        {nees} (expected 3; yaw 1)"] if nees else []
+    nees = ", ".join(f"{k} {v:.2f} ({found.nees_verdict[k]})" for k, v in found.nees.items() if v is not None)
+    lines += [f"NEES        {nees}; expected 3, yaw 1"] if nees else []
     return "\n".join([*lines, *found.notes])
 
 

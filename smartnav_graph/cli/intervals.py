@@ -101,7 +101,7 @@ def intervals_text(found: Sequence[Interval]) -> str:
     for row in found:
         groups.setdefault((row.every_s, row.kind), []).append(row)
     for (every, kind), rows in groups.items():
-        figures = [float(np.mean([getattr(row, name) for row in rows])) for name in names]
-        cells = "".join(f"{value:>10.4f}" for value in figures)
+        figures = [[x for row in rows if (x := getattr(row, name)) is not None] for name in names]
+        cells = "".join(f"{np.mean(x):>10.4f}" if x else f"{'-':>10}" for x in figures)
         lines.append(f"{every:>8g} {kind:<11}{len(rows):>6}{sum(row.n for row in rows):>8}{cells}")
     return "\n".join(lines)

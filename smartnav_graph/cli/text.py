@@ -69,9 +69,9 @@ def withheld_lines(summary: Summary) -> list[str]:
     ]
 
 
-def statistics_line(name: str, unit: str, values: Mapping[str, float] | None) -> str:
+def statistics_line(name: str, unit: str, values: Mapping[str, float | None] | None) -> str:
     """RMS, mean and percentiles of an error."""
     if values is None:
         return f"{name:<12}unknown"
-    figures = " ".join(f"{key} {values[key]:.3f}" for key in ("rmse", "mean", "p50", "p67", "p95", "max"))
+    figures = " ".join(f"{key} {value:.3f}" for key, value in values.items() if value is not None)
     return f"{name:<12}{figures} {unit}"

@@ -12,7 +12,6 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.preparation import PREPARE, Notes, dropped_text, unused_streams
 from smartnav_graph.factors import make_builders
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.gap_model import bridged
 from smartnav_graph.graph import delayed
 from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
 from smartnav_graph.graph.update import Builder
@@ -22,6 +21,7 @@ from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.vision.pairs import Pairs
 
 # Why a row is not in the solution of a replay.
@@ -30,11 +30,13 @@ TOO_LATE = "older than the lag"
 
 @dataclass(frozen=True)
 class Problem:
-    """One estimation problem. `session` lacks the withheld rows; rows of a stream keep their numbers in it."""
+    """One estimation problem. `session` lacks the withheld rows; rows of a stream keep their numbers in it. `imu` is
+    the inertial stream of the windows, with its gaps bridged."""
 
     session: Session
     config: Config
     calibration: Calibration
+    imu: Imu
     windows: Sequence[Window]
     gaps: Sequence[Gap]
     builders: Sequence[Builder]
@@ -97,7 +99,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     notes.warnings += [builder.note for builder in builders if builder.note] + unused_streams(session)
     notes.warnings += [dropped_text(name, counts) for name, counts in notes.dropped.items()]
     return Problem(
-        *(session, config, notes.calibration, windows, notes.gaps, builders),
+        *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
         *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs),
     )
 
@@ -115,8 +117,7 @@ def session_windows(context: FactorContext, span: tuple[int, int]) -> tuple[list
     aiding = {name: stream.t_ns for name, stream in streams.items()}
     epochs = [stream.available_ns if causal else stream.t_ns for stream in streams.values()] + [context.image_ns]
     times = keyframe_times(span, epochs, context.gaps, spacing, standing, causal=causal)
-    imu = bridged(session.require_imu(), context.gaps, context.bridges)
-    windows = make_windows(imu, times, context.gaps, aiding, spacing, rests.spans())
+    windows = make_windows(context.bridged_imu, times, context.gaps, aiding, spacing, rests.spans())
     return delayed.assign(windows, streams, merge) if causal else (windows, {})
 
 
@@ -139,4 +140,4 @@ def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
         return replace(problem, builders=[builder for builder in kept if builder is not None])
     if available_ns is not None:
         windows = delayed.drop_unknown(windows, problem.session.streams(), available_ns)
-    return replace(problem, windows=windows, builders=make_builders(context))
+    return replace(problem, imu=context.bridged_imu, windows=windows, builders=make_builders(context))

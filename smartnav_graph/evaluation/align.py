@@ -14,6 +14,7 @@ from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import best_rotation, from_quaternion, slerp
 from smartnav_graph.core.timebase import NS, interpolate, seconds_since
+from smartnav_graph.graph.interpolate import Kinematics, solution_at
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
 
@@ -42,7 +43,8 @@ class StateSeries:
     """States at n times, of a solution or of a reference; None where not available.
 
     t_ns (n,) on the solution's clock; position (n, 3) m; rotation (n, 3, 3) nav_R_body; velocity (n, 3) m/s;
-    covariance (n, 9, 9) of rotation, position, velocity, nav axes; sigma (n, 3) m.
+    covariance (n, 9, 9) of rotation, position, velocity, nav axes; sigma (n, 3) m. `inertial` gives the states between
+    the rows by inertial data.
     """
 
     t_ns: Times
@@ -51,21 +53,23 @@ class StateSeries:
     velocity: Floats | None = None
     covariance: Floats | None = None
     sigma: Floats | None = None
+    inertial: Callable[[Times], Kinematics] | None = None
 
     def __len__(self) -> int:
         return len(self.t_ns)
 
     def take(self, rows: Mask) -> StateSeries:
         """Only these rows."""
-        known = {name: part for name, part in vars(self).items() if part is not None}
-        return StateSeries(**{name: part[rows] for name, part in known.items()})
+        known = {name: part for name, part in vars(self).items() if isinstance(part, np.ndarray)}
+        return StateSeries(**{name: part[rows] for name, part in known.items()}, inertial=self.inertial)
 
     def inside(self, other: StateSeries) -> Mask:
         """Mask of the rows that lie within the span of `other`."""
         return np.asarray((self.t_ns >= other.t_ns[0]) & (self.t_ns <= other.t_ns[-1]))
 
     def at(self, t_ns: Times) -> StateSeries:
-        """Interpolated: linear, attitude by slerp. Covariances linear too, which keeps them positive definite."""
+        """At stamps (q,) inside the span: by the inertial data, or without them linear, attitude by slerp. Covariances
+        linear, which keeps them positive definite."""
 
         def between(values: Floats | None) -> Floats | None:
             if values is None:
@@ -73,11 +77,13 @@ class StateSeries:
             flat = interpolate(t_ns, self.t_ns, values.reshape(len(self), -1))
             return flat.reshape(len(t_ns), *values.shape[1:])
 
+        there = None if self.inertial is None else self.inertial(t_ns)
+        rotation = None if self.rotation is None else slerp(t_ns, self.t_ns, self.rotation)
         return StateSeries(
             t_ns=t_ns,
-            position=interpolate(t_ns, self.t_ns, self.position),
-            rotation=None if self.rotation is None else slerp(t_ns, self.t_ns, self.rotation),
-            velocity=between(self.velocity),
+            position=interpolate(t_ns, self.t_ns, self.position) if there is None else there.p,
+            rotation=rotation if there is None else there.R,
+            velocity=between(self.velocity) if there is None else there.v,
             covariance=between(self.covariance),
             sigma=between(self.sigma),
         )
@@ -92,6 +98,7 @@ def states_of_solution(solution: Solution) -> StateSeries:
         rotation=solution.nav_R_body,
         velocity=solution.nav_v_body,
         covariance=solution.covariance[:, parts[:, None], parts],
+        inertial=solution_at(solution),
     )
 
 
@@ -263,7 +270,7 @@ def _cost(
     target, stamps = truth.position[rows], t_ns[rows]
 
     def rms(extra_s: float) -> float:
-        position = interpolate(stamps + round(extra_s * NS), estimate.t_ns, estimate.position)
+        position = estimate.at(stamps + round(extra_s * NS)).position
         difference = fit_alignment(method, position, target).position(position) - target
         return float(np.sqrt((difference**2).sum(axis=1).mean()))
 

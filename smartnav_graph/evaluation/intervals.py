@@ -27,10 +27,10 @@ from smartnav_graph.core.so3 import exp, from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.replay import replay
-from smartnav_graph.estimate.result.assemble import kinematics, predict_sensor, sensor_positions
+from smartnav_graph.estimate.result.assemble import predict_sensor, sensor_positions
 from smartnav_graph.estimate.run import Run
 from smartnav_graph.evaluation.metrics import Statistics
-from smartnav_graph.graph.interpolate import predicted_at
+from smartnav_graph.graph.interpolate import kinematics, predicted_at
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import ABSOLUTE, PoseFix, Reference
 
@@ -67,22 +67,25 @@ class Interval:
     seed: int
     n: int
     mean_m: float
-    p67_m: float
-    p95_m: float
+    p67_m: float | None
+    p95_m: float | None
     rmse_m: float
     horizontal_mean_m: float
-    horizontal_p67_m: float
-    horizontal_p95_m: float
+    horizontal_p67_m: float | None
+    horizontal_p95_m: float | None
     horizontal_rmse_m: float
 
     @classmethod
     def of(cls, every_s: float, kind: str, seed: int, error: Floats) -> Interval:
         """Of errors (n, 3) m, nav axes."""
         space, plan = (Statistics.of(np.linalg.norm(rows, axis=1)) for rows in (error, error[:, :2]))
-        figures = [(one.mean, one.p67, one.p95, one.rmse) for one in (space, plan)]
-        return cls(every_s, kind, seed, len(error), *figures[0], *figures[1])
+        return cls(
+            *(every_s, kind, seed, len(error)),
+            *(space.mean, space.p67, space.p95, space.rmse),
+            *(plan.mean, plan.p67, plan.p95, plan.rmse),
+        )
 
-    def to_dict(self) -> dict[str, float | int | str]:
+    def to_dict(self) -> dict[str, float | int | str | None]:
         return asdict(self)
 
 

@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.so3 import log, rotate_back
@@ -34,23 +35,26 @@ from smartnav_graph.evaluation.align import (
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
 from smartnav_graph.session.streams import Reference
 
+LEAST_FOR_PERCENTILES = 20  # errors: the 95 % percentile is then below the largest
+
 
 @dataclass(frozen=True)
 class Statistics:
-    """Root mean square, mean, percentiles (linear between ranks) and maximum of error magnitudes."""
+    """Root mean square, mean, percentiles (linear between ranks) and maximum of error magnitudes; no percentiles (None)
+    of fewer than `LEAST_FOR_PERCENTILES`."""
 
     rmse: float
     mean: float
-    p50: float
-    p67: float
-    p95: float
+    p50: float | None
+    p67: float | None
+    p95: float | None
     max: float
 
     @classmethod
     def of(cls, magnitudes: ArrayLike) -> Statistics:
         """Of magnitudes (n,), n >= 1."""
         x = np.asarray(magnitudes, dtype=np.float64)
-        p50, p67, p95 = (float(p) for p in np.percentile(x, [50, 67, 95]))
+        p50, p67, p95 = map(float, np.percentile(x, [50, 67, 95])) if len(x) >= LEAST_FOR_PERCENTILES else [None] * 3
         return cls(float(np.sqrt((x**2).mean())), float(x.mean()), p50, p67, p95, float(x.max()))
 
 
@@ -69,9 +73,9 @@ class Evaluation:
     """How a solution agrees with a reference.
 
     `nees` are averages, expected 3 for position, velocity and attitude and 1 for yaw; None where the covariance or
-    the reference does not allow them, `notes` say why. Per epoch, errors are solution minus reference after
-    alignment: `t_ns` (n,) on the solution's clock, `error_enu_m` (n, 3), `rotation_error_deg` (n,) geodesic or None,
-    `sigma_enu` (n, 3) m of the solution.
+    the reference does not allow them, `notes` say why; `nees_verdict` says in words what they mean. Per epoch, errors
+    are solution minus reference after alignment: `t_ns` (n,) on the solution's clock, `error_enu_m` (n, 3),
+    `rotation_error_deg` (n,) geodesic or None, `sigma_enu` (n, 3) m of the solution.
     """
 
     solution: str
@@ -81,6 +85,7 @@ class Evaluation:
     unmatched: int
     rpe: tuple[RelativeError, ...]
     nees: dict[str, float | None]
+    nees_verdict: dict[str, str]
     alignment: FrameAlignment
     t_ns: Times
     error_enu_m: Floats
@@ -119,6 +124,7 @@ class Evaluation:
                 for r in self.rpe
             ],
             "nees": dict(self.nees),
+            "nees_verdict": dict(self.nees_verdict),
         }
 
 
@@ -134,7 +140,8 @@ def evaluate(
 ) -> Evaluation:
     """Compare a solution with a reference.
 
-    The solution is interpolated (linear, attitude by slerp) to each reference stamp inside the run, then aligned.
+    The inertial data carry the solution to each reference stamp inside the run (see `interpolate.states_at`); where it
+    holds none it is interpolated (linear, attitude by slerp). Then it is aligned.
 
     Parameters
     ----------
@@ -156,7 +163,8 @@ def evaluate(
     raw = estimate.at(truth.t_ns)
     alignment = fit_alignment(align, raw.position, truth.position)
     matched = aligned(raw, alignment)
-    averages, notes = _consistency(aligned(estimate, alignment), whole)
+    common, expected = _at_common_epochs(estimate, whole)
+    averages, verdicts, notes = _consistency(aligned(common, alignment), expected)
     assert matched.covariance is not None
     return Evaluation(
         solution=solution_name,
@@ -166,6 +174,7 @@ def evaluate(
         unmatched=len(whole) - len(truth),
         rpe=tuple(relative_error(matched, truth, delta) for delta in rpe_deltas_s),
         nees=averages,
+        nees_verdict=verdicts,
         alignment=alignment,
         t_ns=truth.t_ns,
         error_enu_m=matched.position - truth.position,
@@ -233,16 +242,16 @@ def _pairs(t_ns: Times, delta_s: float) -> tuple[NDArray[np.intp], NDArray[np.in
     return i, j
 
 
-def _consistency(estimate: StateSeries, truth: StateSeries) -> tuple[dict[str, float | None], tuple[str, ...]]:
-    """Average NEES of position, velocity, attitude, yaw.
+def _consistency(
+    estimate: StateSeries, truth: StateSeries
+) -> tuple[dict[str, float | None], dict[str, str], tuple[str, ...]]:
+    """Average NEES of position, velocity, attitude, yaw, what they mean, and notes.
 
-    Compared at the epochs of whichever is sparser, the denser one interpolated: a linear interpolation over 1 s
-    between keyframes errs by more than a good solution's sigma. Rows inside a gap of the reference are left out.
     Sigmas of the reference, where given, are added to the covariance of the position.
     """
-    estimate, truth = _at_common_epochs(estimate, truth)
     if not len(truth):
-        return dict.fromkeys(("position", "velocity", "attitude", "yaw")), ("nees: no epoch of the run in reference",)
+        none = dict.fromkeys(("position", "velocity", "attitude", "yaw"))
+        return none, {}, ("nees: no epoch of the run in reference",)
     P = estimate.covariance
     assert P is not None and estimate.rotation is not None and estimate.velocity is not None
     position = P[:, POS, POS]
@@ -256,6 +265,7 @@ def _consistency(estimate: StateSeries, truth: StateSeries) -> tuple[dict[str, f
         checks["attitude"] = (theta, P[:, ROT, ROT])
         checks["yaw"] = (theta[:, 2:], P[:, 2:3, 2:3])
     averages: dict[str, float | None] = {}
+    verdicts: dict[str, str] = {}
     notes: list[str] = []
     for name in ("position", "velocity", "attitude", "yaw"):
         averages[name] = None
@@ -268,7 +278,29 @@ def _consistency(estimate: StateSeries, truth: StateSeries) -> tuple[dict[str, f
             notes.append(f"nees {name}: covariance not positive definite at {bad} of {len(values)} epochs")
         else:
             averages[name] = float(values.mean())
-    return averages, tuple(notes)
+            verdicts[name] = nees_verdict(float(values.mean()), *checks[name])
+    return averages, verdicts, tuple(notes)
+
+
+def nees_verdict(average: float, errors: Floats, covariances: Floats) -> str:
+    """What the average NEES of errors (n, k) says of their covariances (n, k, k), in words.
+
+    It is right inside the 95 % interval of chi2 with as many degrees of freedom as the whitened errors have independent
+    values, n / (1 + 2 sum of their autocorrelation up to its first zero) a component.
+    """
+    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[:, :, None])[:, :, 0]
+    n, k = white.shape
+    power = np.fft.rfft(white, 2 * n, axis=0)
+    correlation = np.fft.irfft(np.abs(power) ** 2, axis=0)[:n]
+    correlation = correlation / np.maximum(correlation[0], 1e-300)
+    positive = np.logical_and.accumulate(correlation > 0.0, axis=0)
+    independent = float((n / np.maximum(2.0 * (correlation * positive).sum(axis=0) - 1.0, 1.0)).sum())
+    low, high = chi2.ppf([0.025, 0.975], independent) / independent
+    ratio = average / k
+    if low <= ratio <= high:
+        return "sigmas right"
+    factor = max(float(np.sqrt(ratio)), 1e-9)
+    return f"sigmas {factor:.2g} times too small" if factor > 1.0 else f"sigmas {1.0 / factor:.2g} times too large"
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
@@ -296,6 +328,8 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
 
 
 def _at_common_epochs(estimate: StateSeries, truth: StateSeries) -> tuple[StateSeries, StateSeries]:
+    """Both at the epochs of whichever is sparser, the denser one interpolated: a linear interpolation over 1 s errs by
+    more than a good solution's sigma. Rows inside a gap of the reference are left out."""
     inside, covered = truth.take(truth.inside(estimate)), estimate.take(estimate.inside(truth))
     if len(inside) <= len(covered):
         return estimate.at(inside.t_ns), inside

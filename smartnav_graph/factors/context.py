@@ -17,6 +17,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import Imu
 from smartnav_graph.vision.pairs import Pairs
 
 Section = TypeVar("Section")
@@ -54,6 +55,11 @@ class FactorContext:
         """The bridge of every gap, by its start stamp."""
         noise = self.calibration.imu_noise
         return gap_model.bridges(self.session.require_imu(), self.gaps, noise, causal=self.causal)
+
+    @cached_property
+    def bridged_imu(self) -> Imu:
+        """The inertial data with a curve across every gap."""
+        return gap_model.bridged(self.session.require_imu(), self.gaps, self.bridges)
 
     @cached_property
     def camera_name(self) -> str:

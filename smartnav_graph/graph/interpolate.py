@@ -6,7 +6,8 @@ rotation linearly, position and velocity by the cubic that meets both at both en
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import exp, log
 from smartnav_graph.core.timebase import NS
+from smartnav_graph.graph.keyframes import KeyframeConfig, make_windows
+from smartnav_graph.graph.solution import Solution
 from smartnav_graph.graph.windows import Window
 
 # Inertial samples that are integrated together: some twenty megabytes.
@@ -28,6 +31,22 @@ class Kinematics(NamedTuple):
     p: Floats
     v: Floats
     bias: Floats
+
+
+def kinematics(solution: Solution) -> Kinematics:
+    """The states of a solution as `states_at` takes them."""
+    bias = np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
+    return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
+
+
+def solution_at(solution: Solution) -> Callable[[NDArray[np.int64]], Kinematics] | None:
+    """States of a solution at any stamps (q,) inside its span, by its inertial data; None where it has none, or none
+    between its epochs."""
+    imu = solution.imu
+    if imu is None or len(imu) < 2 * len(solution):
+        return None
+    windows = make_windows(imu, solution.t_ns, (), {}, KeyframeConfig())
+    return partial(states_at, windows, kinematics(solution), solution.gravity)
 
 
 def states_at(windows: Sequence[Window], states: Kinematics, gravity: float, t_ns: NDArray[np.int64]) -> Kinematics:

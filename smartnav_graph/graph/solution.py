@@ -15,6 +15,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import quaternion
 from smartnav_graph.core.timebase import seconds_since
+from smartnav_graph.session.streams import Imu
 
 ROT, POS, VEL, ACCEL_BIAS, GYRO_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
 COVARIANCE_NAMES = tuple(
@@ -66,7 +67,8 @@ class Solution:
     t_ns (n,) int64 on the IMU's clock; nav_R_body (n, 3, 3); nav_t_body (n, 3) m; nav_v_body (n, 3) m/s;
     accel_bias (n, 3) m/s^2 and gyro_bias (n, 3) rad/s in body axes; covariance (n, 15, 15) in the order rotation,
     position, velocity (nav axes), accelerometer bias, gyroscope bias (body axes). The rotation error is the nav-axes
-    vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame.
+    vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame. `imu` is the
+    inertial stream that carries the states from epoch to epoch, under `gravity` m/s^2; None where it is not known.
     """
 
     t_ns: NDArray[np.int64]
@@ -81,6 +83,8 @@ class Solution:
     forward: str = "+y"
     up: str = "+z"
     residuals: Residuals = field(default_factory=Residuals.empty)
+    imu: Imu | None = None
+    gravity: float = frames.STANDARD_GRAVITY
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -170,6 +174,8 @@ def from_columns(
     forward: str = "+y",
     up: str = "+z",
     residuals: Residuals | None = None,
+    imu: Imu | None = None,
+    gravity: float = frames.STANDARD_GRAVITY,
 ) -> Solution:
     """The inverse of `Solution.all_columns`."""
 
@@ -194,4 +200,6 @@ def from_columns(
         forward=forward,
         up=up,
         residuals=residuals or Residuals.empty(),
+        imu=imu,
+        gravity=gravity,
     )

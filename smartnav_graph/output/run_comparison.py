@@ -82,7 +82,7 @@ class RunDifferences:
     def _row(self, measure: Measure) -> tuple[str, ...]:
         one = self.states.statistics(measure)
         s = one.statistics
-        figures = [f"{value:.4g}" for value in (s.rmse, s.p50, s.p95, s.max)]
+        figures = ["-" if value is None else f"{value:.4g}" for value in (s.rmse, s.p50, s.p95, s.max)]
         name = f"{measure.name.split('_')[0]}{' bias' if 'bias' in measure.name else ''} {measure.unit}"
         return (name, *figures, f"{one.largest_at_s:.2f}", f"{one.largest_sigmas:.2f}", f"{one.sigma_ratio:.3f}")
 

@@ -1,7 +1,8 @@
 """The folder a run leaves behind, and reading it back.
 
 trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
-keyframes.parquet, influence.parquet (the linear system at the solution, see `evaluation.influence`), summary.json,
+imu.parquet (as used: corrected, gaps bridged), keyframes.parquet, influence.parquet (the linear system at the solution,
+see `evaluation.influence`), summary.json,
 config.toml, calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
 """
 
@@ -20,7 +21,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.files import refuse_existing, refuse_foreign, replacing, write_table
+from smartnav_graph.core.files import read_table, refuse_existing, refuse_foreign, replacing, write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate import config as config_model
@@ -34,10 +35,11 @@ from smartnav_graph.output.summary_json import Summary, as_float, numbers_of, pl
 from smartnav_graph.session.calibration import model as calibration_model
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.streams import Imu
 
 Columns = dict[str, NDArray[np.generic]]
 
-SUMMARY = "summary.json"
+SUMMARY, IMU = "summary.json", "imu.parquet"
 # Parts of a summary that differ between equal runs.
 UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")
 
@@ -151,6 +153,7 @@ def _session_key(run: Run) -> dict[str, object]:
         "t0_ns": solution.t0_ns,
         "forward": solution.forward,
         "up": solution.up,
+        "gravity_m_s2": solution.gravity,
         "origin": None if solution.origin is None else dataclasses.asdict(solution.origin),
     }
 
@@ -172,11 +175,19 @@ def _write_tables(run: Run, folder: Path) -> None:
         write_trajectory_csv(solution, folder / f"{text}.csv")
         write_table(solution.all_columns(), folder / f"{table}.parquet")
     write_table(residual_columns(run.solution.residuals), folder / "residuals.parquet")
+    write_table(carrying_columns(run), folder / IMU)
     rows = withheld_columns(run)
     if rows:
         write_table(rows, folder / "withheld.parquet")
     if run.estimate is not None:
         Influence.of(run.estimate, run.problem.windows).write(folder)
+
+
+def carrying_columns(run: Run) -> Columns:
+    """The columns of imu.parquet: the inertial data that carry the states from epoch to epoch."""
+    imu, (start, end) = run.problem.imu, run.solution.t_ns[[0, -1]]
+    first, last = np.searchsorted(imu.t_ns, start, side="right") - 1, np.searchsorted(imu.t_ns, end) + 1
+    return Imu(t_ns=imu.t_ns, gyro=imu.gyro, accel=imu.accel).take(slice(max(first, 0), last)).columns()
 
 
 def residual_columns(residuals: Residuals) -> Columns:
@@ -272,7 +283,7 @@ def read_run(path: str | Path) -> StoredRun:
         raise SessionError(path, found, "a run folder", "make one with `smartnav smooth`")
     try:
         summary: dict[str, object] = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-        frame = _frame(table_of(summary, "session"))
+        frame = _frame(table_of(summary, "session"), path / IMU)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(
             path / SUMMARY, f"cannot be read ({error!r})", "the summary of a run", "smooth the session again"
@@ -286,10 +297,13 @@ def read_run(path: str | Path) -> StoredRun:
     )
 
 
-def _frame(session: Mapping[str, Any]) -> dict[str, Any]:
-    """What a solution needs of the session it was estimated from."""
+def _frame(session: Mapping[str, Any], imu: Path) -> dict[str, Any]:
+    """What a solution needs of the session it was estimated from, and its inertial data, which an older run has not."""
     origin = None if session["origin"] is None else Origin(**session["origin"])
-    return {"t0_ns": int(session["t0_ns"]), "origin": origin} | {key: str(session[key]) for key in ("forward", "up")}
+    found: dict[str, Any] = {"t0_ns": int(session["t0_ns"]), "origin": origin}
+    if imu.is_file():
+        found |= {"imu": Imu.from_columns(read_table(imu)), "gravity": float(session["gravity_m_s2"])}
+    return found | {key: str(session[key]) for key in ("forward", "up")}
 
 
 def _read_states(path: Path, frame: Mapping[str, Any], residuals: Residuals | None = None) -> Solution:

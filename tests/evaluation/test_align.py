@@ -9,6 +9,7 @@ import pytest
 from planted_run import T0, make_reference, make_solution
 from scipy.spatial.transform import Rotation
 
+import smartnav_graph as sn
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_seconds, ns_from_texts
 from smartnav_graph.evaluation import evaluate
@@ -157,3 +158,26 @@ def test_real_clocks_and_frames_are_matched_by_themselves():
     assert result.alignment.scale == pytest.approx(1 / 0.9981, abs=3e-4)
     assert result.ape_m.p50 < 0.15  # m; linear interpolation over 1 s
     assert result.matched == 4539 and result.unmatched == 2
+
+
+def test_inertial_data_carry_the_attitude_of_a_walk_between_keyframes():
+    session = sn.simulate("walk-60s", 1)
+    keyframes, dense = (sn.run(session, rate=rate).solution for rate in ("keyframes", "imu"))
+    carried, known, straight = (
+        evaluate(solution, session.reference).rotation_deg.rmse
+        for solution in (keyframes, dense, dataclasses.replace(keyframes, imu=None))
+    )
+    assert len(keyframes) < 100 < len(dense)
+    assert carried == pytest.approx(known, rel=0.05)  # the end discrepancy of a window is spread alike
+    assert straight > 5.0 * carried  # a step turns the body by degrees
+
+
+def test_time_offset_is_found_at_states_carried_by_inertial_data():
+    session = sn.simulate("figure-eight-60s", 1)
+    solution = sn.run(session).solution
+    late = dataclasses.replace(session.reference, t_ns=session.reference.t_ns + NS // 4)
+    at_once, shifted = (
+        evaluate(solution, reference, align="yaw", time_offset_s="auto").time_offset_s
+        for reference in (session.reference, late)
+    )
+    assert shifted == pytest.approx(at_once - 0.25, abs=0.01)  # s

@@ -10,6 +10,7 @@ from planted_run import make_reference, make_solution
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.evaluation import Statistics, evaluate
+from smartnav_graph.evaluation.metrics import nees, nees_verdict
 
 
 def noisy(seconds, rng, sigma_m=0.3, sigma_rad=0.05):
@@ -152,9 +153,35 @@ def test_json_has_the_documented_keys(seconds):
         make_solution(seconds), make_reference(seconds), solution_name="causal", reference_name="truth.csv"
     )
     data = json.loads(json.dumps(result.to_dict(), allow_nan=False))
-    names = "solution reference align time_offset_s matched unmatched ape_m rotation_deg rpe nees"
+    names = "solution reference align time_offset_s matched unmatched ape_m rotation_deg rpe nees nees_verdict"
     assert list(data) == names.split()
     assert list(data["ape_m"]) == list(data["rotation_deg"]) == ["rmse", "mean", "p50", "p67", "p95", "max"]
     assert [list(r) for r in data["rpe"]] == [["delta_s", "translation_m", "rotation_deg"]] * 3
     assert set(data["nees"]) >= {"position", "velocity", "attitude"}
     assert data["solution"] == "causal" and data["reference"] == "truth.csv"
+
+
+def test_percentiles_need_twenty_errors():
+    few, enough = Statistics.of(np.arange(19.0)), Statistics.of(np.arange(20.0))
+    assert (few.p50, few.p67, few.p95) == (None, None, None)
+    assert few.max == 18.0 and few.mean == 9.0
+    assert enough.p50 == 9.5
+
+
+@pytest.mark.parametrize(
+    ("scale", "constant", "verdict"),
+    [
+        (1.0, False, "sigmas right"),
+        (2.0, False, "sigmas 2.1 times too small"),
+        (0.5, False, "sigmas 1.9 times too large"),
+        (1.5, True, "sigmas right"),  # one draw at 1.5 sigma, however often it is seen
+        (9.0, True, "sigmas 9 times too small"),
+    ],
+)
+def test_nees_in_words_counts_independent_errors(scale, constant, verdict):
+    errors = np.random.default_rng(4).normal(size=(400, 3))
+    if constant:
+        errors = np.ones((400, 3))
+    covariances = np.tile(np.eye(3), (400, 1, 1))
+    average = float(nees(scale * errors, covariances).mean())
+    assert nees_verdict(average, scale * errors, covariances) == verdict

@@ -20,7 +20,7 @@ from smartnav_graph.estimate.reweight.outliers import FixResiduals, fix_residual
 from smartnav_graph.estimate.reweight.track_outliers import whitened
 from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.factors.gnss import PositionBuilder
-from smartnav_graph.graph.interpolate import Kinematics, states_at
+from smartnav_graph.graph.interpolate import Kinematics, kinematics, states_at
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import loss_weights
 from smartnav_graph.graph.solution import Residuals, Solution
@@ -84,6 +84,8 @@ def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, cov
         origin=session.origin,
         forward=session.device.forward,
         up=session.device.up,
+        imu=problem.imu,
+        gravity=session.gravity,
     )
 
 
@@ -190,12 +192,6 @@ def _flat(parts: Sequence[Part]) -> Residuals:
         weight=spread(lambda part: part[3]),
         used=spread(lambda part: part[4]),
     )
-
-
-def kinematics(solution: Solution) -> Kinematics:
-    """The states of a solution as `prediction` takes them."""
-    bias = np.concatenate([solution.accel_bias, solution.gyro_bias], axis=1)
-    return Kinematics(solution.nav_R_body, solution.nav_t_body, solution.nav_v_body, bias)
 
 
 def score_holdout(problem: Problem, keyframes: Solution, estimate: Estimate) -> dict[str, Withheld]:
