@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.estimate.config import Config
@@ -16,12 +17,13 @@ from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
+from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
 from smartnav_graph.vision.pairs import Pairs
-from smartnav_graph.vision.zero_motion import static_periods
+from smartnav_graph.vision.zero_motion import moving_spans, static_periods
 
 
 @dataclass
@@ -182,6 +184,30 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     return session
 
 
+def refute_standstills(session: Session, notes: Notes) -> Session:
+    """Standstills without the parts in which positions, speeds or images show motion."""
+    rests = notes.rests
+    if rests is None or not rests.still.any():
+        return session
+    spans = [] if notes.pairs is None else moving_spans(notes.pairs).tolist()
+    available_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None
+    images = [Moving("images", *span) for span in spans]
+    moving = find_moving(session, rests, notes.calibration.gnss_noise, images, available_ns)
+    notes.rests = without_moving(rests, moving)
+    lost = runs(rests.still & ~notes.rests.still)
+    if len(lost):
+        first, last = (float(t - session.t0_ns) / NS for t in (rests.t_ns[lost[0, 0]], rests.t_ns[lost[-1, 1] - 1]))
+        length_s = float((rests.t_ns[lost[:, 1] - 1] - rests.t_ns[lost[:, 0]]).sum()) / NS
+        names, speed = " and ".join(sorted({one.sensor for one in moving})), max(one.speed for one in moving)
+        fast = "" if np.isnan(speed) else f" at up to {speed:.1f} m/s"
+        notes.warnings.append(
+            f"standstill: {length_s:.1f} s between {first:.1f} and {last:.1f} s are listed or look like a standstill "
+            f"to the inertial data, but {names} show motion{fast}: not used as a standstill; if the device did rest, "
+            "check clock and outliers of that sensor"
+        )
+    return session
+
+
 PREPARE: Mapping[str, PreparationStep] = {
     "span": choose_span,
     "gaps": find_imu_gaps,
@@ -194,6 +220,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "lead": trim_span,
     "images": pair_images,
     "standstills": detect_standstills,
+    "moving": refute_standstills,
 }
 
 

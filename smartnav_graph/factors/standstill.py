@@ -79,6 +79,8 @@ class StandstillBuilder(Builder):
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors at the keyframe that ends `window`."""
         speed = self.rests.speed_at(window.t1_ns)
+        if np.isfinite(speed) and pass_state.refuted and self.rests.start_of(window.t1_ns) in pass_state.refuted:
+            return
         if np.isfinite(speed):
             if self.config.zupt:
                 self._add_speed(update, speed, _unknown(previous))

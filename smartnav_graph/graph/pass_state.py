@@ -49,6 +49,7 @@ class PassState:
     outlier_tests : how often image pairs and tracks were tested against a solution, by builder
     weights, gnc_mu : weights of rows between 0 and 1 by sensor, and the control parameter mu of GNC
     robust_floor_m : least sigma (m) of a fix under the redescending loss
+    refuted : first stamp of the standstills in which the solution moves
     """
 
     noise_scales: Mapping[str, float] = field(default_factory=dict)
@@ -63,6 +64,7 @@ class PassState:
     weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     gnc_mu: float = 0.0
     robust_floor_m: float = 0.0
+    refuted: frozenset[int] = frozenset()
 
     def weight(self, sensor: str, row: int) -> float:
         """Weight of a row under GNC, 1 otherwise."""

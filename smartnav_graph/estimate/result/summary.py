@@ -17,6 +17,7 @@ from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld, used_counts
 from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
+from smartnav_graph.estimate.reweight.false_standstills import refuted_text
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
@@ -88,6 +89,7 @@ def summarise(
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused]
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
+    warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
     summary: dict[str, Any] = {
         "mode": mode,
         "vehicle": problem.vehicle,

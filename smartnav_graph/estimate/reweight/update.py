@@ -19,6 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
+from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
 from smartnav_graph.estimate.reweight.imu_noise import noise_scales
 from smartnav_graph.estimate.reweight.outliers import (
@@ -71,6 +72,8 @@ def update_pass_state(
         return new, done
     tested = check_pairs(builders, estimate, new)
     tested = check_tracks(builders, estimate, tested) if tested is new else tested
+    if done and tested is new:
+        tested = drop_standstills(builders, windows, estimate, new)
     return tested, done and tested is new
 
 

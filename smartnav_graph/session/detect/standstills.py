@@ -123,6 +123,15 @@ class Standstills:
         part = values[i : j + 1]
         return float(part.max()) if len(part) else np.nan
 
+    def start_of(self, t_ns: int) -> int | None:
+        """First stamp of the standstill that a stamp lies in."""
+        return next((first for first, last in self.spans() if first <= t_ns <= last), None)
+
+    def share(self, t0_ns: int, t1_ns: int) -> float:
+        """Share of the samples from t0 to t1 without velocity."""
+        i, j = np.searchsorted(self.t_ns, [t0_ns, t1_ns + 1])
+        return float(self.still[i:j].mean()) if j > i else 0.0
+
     def keyframes(self, inner_s: float | None = None, *, causal: bool = False) -> Times:
         """Borders of all standstills, and stamps at most `inner_s` apart inside them: evenly, or `inner_s` after each
         other where it is not known yet when one ends (`causal`)."""
