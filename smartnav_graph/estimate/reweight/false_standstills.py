@@ -1,8 +1,8 @@
 """A standstill is a hypothesis: once all else is settled it is dropped where the solution moves in it all the same.
 
 The normalised square of zero velocity, |v|^2 / sigma^2, has a redundancy of three at most at each of its keyframes. A
-standstill of which most keyframes lie far beyond that is none; the redescending loss has let go of it, but what it
-still pulls at, and its keyframes without turn, are wrong. A foot has a new hypothesis at every step, and its loss.
+standstill of which most keyframes lie far beyond that is none: its redescending loss leaves some weight, and its
+constraint of no turn is wrong too. A foot has a new hypothesis at every step, and a loss for it.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def find_moving(
             found += (replace(one, sensor=name) for one in fixes.moving(begin, end, from_ns))
     for name, readings in _speeds(session, noise).items():
         found += (replace(one, sensor=name) for one in readings.moving() if rests.share(one.start_ns, one.end_ns) > 0.0)
-    # a camera in the hand of a pedestrian who stands turns
+    # only where the gyroscope shows no turn: turns move the points too
     found += [one for one in images if any(one.start_ns < b and one.end_ns > a for a, b in at_rest)]
     return found if from_ns is not None else [*found, *_remains(rests, stretches, found)]
 
