@@ -19,6 +19,7 @@ from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
+from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
@@ -31,13 +32,15 @@ class Notes:
     """What the steps find beside the session.
 
     causal : for a replay; span : first and last stamp to smooth; gaps : of the inertial data inside it
-    withheld : rows held out, by stream; dropped : rows that are not used, by stream and reason
+    clocks : comparison of the sensors' clocks; withheld : rows held out, by stream; dropped : rows that are not used,
+    by stream and reason
     """
 
     config: Config
     causal: bool = False
     span: tuple[int, int] = (0, 0)
     gaps: Sequence[Gap] = ()
+    clocks: ClockReport = ClockReport()
     calibration: Calibration = field(default_factory=Calibration)
     withheld: Mapping[str, Positioned] = field(default_factory=dict)
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -79,9 +82,31 @@ def find_imu_gaps(session: Session, notes: Notes) -> Session:
     return session
 
 
+def align_clocks(session: Session, notes: Notes) -> Session:
+    """Fixes on the clock of the inertial data, where both show that they are not, by more than the state of a clock
+    takes. By rows that are not withheld; in a replay by what is known when it begins, and what all rows show of an
+    offset is only said."""
+    imu = session.require_imu()
+    kept, _ = split(session, notes.config.run.withhold)
+    first, last = notes.span
+    kept = kept.replace(imu=imu.take((imu.t_ns >= first) & (imu.t_ns <= last)))
+    found = kept if not notes.causal else _known_by(kept, first + round(INITIALISATION_S * NS))
+    session, notes.clocks = apply_offsets(session, compare_clocks(found))
+    if notes.causal and not any(offset.applied for offset in notes.clocks.offsets):
+        notes.clocks = compare_clocks(kept)
+    return session
+
+
+def _known_by(session: Session, last_ns: int) -> Session:
+    """Inertial data and positions that are known at a time."""
+    streams = {"imu": session.require_imu(), **session.positions()}
+    known: dict[str, Stream] = {name: stream.take(stream.available_ns <= last_ns) for name, stream in streams.items()}
+    return session.replace(**known)
+
+
 def check_health(session: Session, notes: Notes) -> Session:
     """Errors of the recording stop, warnings are noted."""
-    checked = health.inspect(session, notes.gaps)
+    checked = health.inspect(session, notes.gaps, notes.clocks)
     checked.raise_errors()
     notes.warnings += checked.warnings()
     return session
@@ -211,6 +236,7 @@ def refute_standstills(session: Session, notes: Notes) -> Session:
 PREPARE: Mapping[str, PreparationStep] = {
     "span": choose_span,
     "gaps": find_imu_gaps,
+    "clocks": align_clocks,
     "health": check_health,
     "calibration": calibrate,
     "sensors": choose_sensors,

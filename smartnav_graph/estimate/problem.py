@@ -19,6 +19,7 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills
+from smartnav_graph.session.health.clocks import ClockReport
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import Imu
@@ -45,6 +46,7 @@ class Problem:
     warnings: Sequence[str] = ()
     rests: Standstills | None = None
     pairs: Pairs | None = None
+    clocks: ClockReport = ClockReport()
 
     @property
     def vehicle(self) -> str:
@@ -100,7 +102,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     notes.warnings += [dropped_text(name, counts) for name, counts in notes.dropped.items()]
     return Problem(
         *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
-        *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs),
+        *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks),
     )
 
 

@@ -105,6 +105,7 @@ def summarise(
         "converged": estimate.converged,
         "cost": estimate.cost,
         "states": _states(solved),
+        "clock": problem.clocks.to_dict(),
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),

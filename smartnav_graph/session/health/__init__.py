@@ -15,6 +15,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import Gap, find_gaps, seconds_since
 from smartnav_graph.session.health import inertial, positions, sensors
 from smartnav_graph.session.health import streams as all_streams
+from smartnav_graph.session.health.clocks import ClockReport, compare_clocks
 from smartnav_graph.session.health.facts import AIDING, Facts, Finding
 from smartnav_graph.session.health.inertial import quiet_accel, tilt_errors
 from smartnav_graph.session.session import Session
@@ -81,8 +82,9 @@ class Health:
         return "\n".join(lines + [f"{finding.level}: {finding}" for finding in self.findings])
 
 
-def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
-    """The health of a session; `gaps` of the inertial stream, where they are known already.
+def inspect(session: Session, gaps: Sequence[Gap] | None = None, clocks: ClockReport | None = None) -> Health:
+    """The health of a session; `gaps` of the inertial stream and the comparison of `clocks`, where they are known
+    already.
 
     Streams that will not be used can be left out: ``inspect(session.replace(magnetometer=None))``.
     """
@@ -91,7 +93,8 @@ def inspect(session: Session, gaps: Sequence[Gap] | None = None) -> Health:
     if gaps is None:
         gaps = [] if usable is None else find_gaps(usable.t_ns, np.hstack([usable.gyro, usable.accel]))
     facts = Facts(session, tuple(gaps), None if usable is None else quiet_accel(usable))
-    findings = [finding for rule in RULES for finding in rule(facts)]
+    clocks = clocks or compare_clocks(session)
+    findings = [*clocks.findings, *(finding for rule in RULES for finding in rule(facts))]
     parts = {
         "imu": imu is not None,
         f"absolute sensor ({', '.join(ABSOLUTE)})": bool(session.absolute()),

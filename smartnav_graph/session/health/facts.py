@@ -24,12 +24,18 @@ _ODD = 1.3  # a factor that slip or tyres do not explain
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``."""
+    """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``.
+
+    size : of the fault, in the unit of the text; start_ns, end_ns : where it is, where it is not everywhere
+    """
 
     where: str
     text: str
     remedy: str = ""
     level: str = "warning"
+    size: float | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
 
     def __str__(self) -> str:
         return f"{self.where}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")

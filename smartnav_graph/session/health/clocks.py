@@ -1,0 +1,94 @@
+"""Clocks of the position sensors against the inertial data; see `detect.clock`. Not a rule of `inspect`: it is applied
+before, and what it finds is among the findings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from smartnav_graph.core.timebase import LEAP_SECONDS, NS
+from smartnav_graph.session.detect.clock import ClockOffset, FixTrack, find_clock_offset
+from smartnav_graph.session.detect.motion import inertial_motion
+from smartnav_graph.session.health.facts import Finding
+from smartnav_graph.session.session import Session
+
+# Lags below are of the receiver and its filter, and are estimated as a state.
+STATE_S = 1.5
+_GPS_EPOCH_S = 315_964_800.0
+_SENSORS = ("gnss", "pose_fixes")
+
+
+@dataclass(frozen=True)
+class ClockReport:
+    """What a comparison of the sensors' clocks finds: an offset for each sensor that could be compared."""
+
+    offsets: tuple[ClockOffset, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def to_dict(self) -> dict[str, dict[str, float | bool]]:
+        """Offsets by sensor, seconds."""
+        return {
+            o.sensor: {"lag_s": o.lag_s, "sigma_s": o.sigma_s, "sharpness": o.sharpness}
+            | {"known": o.known, "applied": o.applied}
+            for o in self.offsets
+        }
+
+
+def compare_clocks(session: Session) -> ClockReport:
+    """Offsets of the position sensors to the inertial data of a session."""
+    if session.imu is None or len(session.imu) < 2:
+        return ClockReport()
+    streams = {name: stream for name, stream in session.positions().items() if name in _SENSORS}
+    motion = inertial_motion(session.imu) if streams else None
+    if motion is None:
+        return ClockReport()
+    tracks = {
+        name: FixTrack.of(stream.t_ns, session.nav_position(stream), motion.start_ns)
+        for name, stream in streams.items()
+    }
+    found = [find_clock_offset(name, motion, track) for name, track in tracks.items()]
+    offsets = tuple(offset for offset in found if offset is not None)
+    return ClockReport(offsets, tuple(_late(offset) for offset in offsets if beyond_state(offset)))
+
+
+def beyond_state(offset: ClockOffset) -> bool:
+    """Whether an offset is known, and larger than what is estimated as a state."""
+    return offset.known and abs(offset.lag_s) > STATE_S
+
+
+def apply_offsets(session: Session, report: ClockReport) -> tuple[Session, ClockReport]:
+    """Stamps without the offsets that exceed what is estimated as a state, and the report that says so.
+
+    The arrival of rows shifts with them: it is of the same clock.
+    """
+    changes, offsets = {}, []
+    for offset in report.offsets:
+        if beyond_state(offset):
+            stream = session.positions()[offset.sensor]
+            shift = round(offset.lag_s * NS)
+            arrival = None if stream.arrival_ns is None else stream.arrival_ns - shift
+            changes[offset.sensor] = replace(stream, t_ns=stream.t_ns - shift, arrival_ns=arrival)
+            offset = replace(offset, applied=True)
+        offsets.append(offset)
+    findings = tuple(_late(offset) for offset in offsets if beyond_state(offset))
+    return session.replace(**changes), replace(report, offsets=tuple(offsets), findings=findings)
+
+
+def _late(offset: ClockOffset) -> Finding:
+    way = "late" if offset.lag_s > 0 else "early"
+    text = f"stamps are {abs(offset.lag_s):.2f} s {way} against the motion of the IMU, +- {offset.sigma_s:.2f} s"
+    name = _name(offset.lag_s)
+    remedy = "corrected for this run" if offset.applied else "`smartnav smooth` corrects it; better mend the stamps"
+    return Finding(offset.sensor, text + (f": {name}" if name else ""), remedy, size=offset.lag_s)
+
+
+def _name(lag_s: float) -> str:
+    """What clocks differ by so much, within the lag of a receiver."""
+    size = abs(lag_s)
+    if abs(size - LEAP_SECONDS) < STATE_S:
+        return f"GPS time against UTC ({LEAP_SECONDS} leap seconds)"
+    if abs(size - _GPS_EPOCH_S) < LEAP_SECONDS + STATE_S:
+        return "GPS epoch against Unix epoch"
+    hours = size / 3600.0
+    if 0.5 < hours < 14.5 and abs(size - 900.0 * round(4.0 * hours)) < STATE_S:
+        return f"{round(4.0 * hours) / 4.0:g} hours: local time of a time zone against UTC"
+    return ""
