@@ -62,7 +62,8 @@ def test_phone_noise_in_fixes(kitti) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_fixes_of_another_motion_have_no_known_offset(kitti, seed: int) -> None:
     other = sn.simulate("phone-car-5min", seed)
-    both = kitti.replace(gnss=replace(kitti.gnss.take(slice(0, 300)), enu=other.nav_position(other.gnss)[:300], lla=None))
+    enu = other.nav_position(other.gnss)[:300]
+    both = kitti.replace(gnss=replace(kitti.gnss.take(slice(0, 300)), enu=enu, lla=None))
     assert not offset(both).known
     assert not offset(kitti, 0.0, lambda p: p[::-1]).known
 
