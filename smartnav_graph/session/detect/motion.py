@@ -48,7 +48,7 @@ class InertialMotion:
         return len(self.heading) * STEP_S
 
 
-def inertial_motion(imu: Imu, gyro_signs: tuple[int, int, int] = (1, 1, 1)) -> InertialMotion | None:
+def levelled_motion(imu: Imu, gyro_signs: tuple[int, int, int] = (1, 1, 1)) -> InertialMotion | None:
     """Motion by the inertial data, the axes of gyro with these signs; None for less than 10 s or more than a day."""
     if not _LENGTH_S[0] < (int(imu.t_ns[-1]) - int(imu.t_ns[0])) / NS < _LENGTH_S[1]:
         return None

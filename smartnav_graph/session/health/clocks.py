@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from smartnav_graph.core.timebase import LEAP_SECONDS, NS
 from smartnav_graph.session.detect.clock import ClockOffset, FixTrack, find_clock_offset
-from smartnav_graph.session.detect.motion import inertial_motion
+from smartnav_graph.session.detect.motion import levelled_motion
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 
@@ -38,7 +38,7 @@ def compare_clocks(session: Session) -> ClockReport:
     if session.imu is None or len(session.imu) < 2:
         return ClockReport()
     streams = {name: stream for name, stream in session.positions().items() if name in _SENSORS}
-    motion = inertial_motion(session.imu) if streams else None
+    motion = levelled_motion(session.imu) if streams else None
     if motion is None:
         return ClockReport()
     tracks = {

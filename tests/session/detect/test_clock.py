@@ -8,12 +8,12 @@ import pytest
 import smartnav_graph as sn
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.detect.clock import ClockOffset, FixTrack, find_clock_offset
-from smartnav_graph.session.detect.motion import STEP_S, inertial_motion
+from smartnav_graph.session.detect.motion import STEP_S, levelled_motion
 from smartnav_graph.session.session import Session
 
 
 def offset(session: Session, shift_s: float = 0.0, change=lambda p: p) -> ClockOffset | None:
-    motion, fixes = inertial_motion(session.imu), session.gnss
+    motion, fixes = levelled_motion(session.imu), session.gnss
     t_ns = fixes.t_ns + round(shift_s * NS)
     return find_clock_offset("gnss", motion, FixTrack.of(t_ns, change(session.nav_position(fixes)), motion.start_ns))
 
@@ -28,7 +28,7 @@ def part(session: Session, begin_s: float, end_s: float) -> Session:
 
 def test_motion_of_exact_inertial_data_is_the_true_one() -> None:
     session = sn.simulate("phone-car-5min", 3)
-    truth, motion = session.reference, inertial_motion(session.imu)
+    truth, motion = session.reference, levelled_motion(session.imu)
     t = session.seconds(truth.t_ns)
     heading = np.unwrap(np.arctan2(truth.velocity[:, 1], truth.velocity[:, 0]))
     moving = np.linalg.norm(truth.velocity, axis=1) > 3.0
@@ -75,6 +75,6 @@ def test_where_nothing_shows_the_lag_it_is_unknown_or_right(name: str) -> None:
 
 
 def test_too_few_fixes_are_not_compared(kitti) -> None:
-    assert inertial_motion(part(kitti, 60.0, 68.0).imu) is None
+    assert levelled_motion(part(kitti, 60.0, 68.0).imu) is None
     short = part(kitti, 60.0, 120.0)
     assert offset(short.replace(gnss=short.gnss.take(slice(None, None, 10)))) is None
