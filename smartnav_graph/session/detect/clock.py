@@ -127,14 +127,14 @@ def _at(values: Complexes, step: Floats) -> Complexes:
 
 def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Floats:
     """Log likelihood (k,) of lags (k,) s by the course: of chords between fixes, and of longer ones of less noise."""
-    turned: Complexes = np.concatenate([[0j], np.cumsum(np.exp(2j * motion.heading)) * STEP_S])
+    axis: Complexes = np.concatenate([[0j], np.cumsum(np.exp(2j * motion.heading)) * STEP_S])
     score = np.zeros(len(lags))
     for begin, end, d in (fixes.chords(1), fixes.chords(max(1, round(_LONG_CHORD_S / fixes.spacing_s)))):
         square, middle = d**2, 0.5 * (begin + end)
         blocks = np.array_split(np.arange(len(d)), max(1, round((middle[-1] - middle[0]) / _BLOCK_S)))
         for part in np.array_split(np.arange(len(lags)), -(-len(lags) // 500)):
             lag = lags[part, None]
-            mean = (_at(turned, (end - lag) / STEP_S) - _at(turned, (begin - lag) / STEP_S)) / (end - begin)
+            mean = (_at(axis, (end - lag) / STEP_S) - _at(axis, (begin - lag) / STEP_S)) / (end - begin)
             along = np.conj(np.nan_to_num(mean)) * square
             for rows in blocks:
                 t = middle[rows] - middle[rows].mean()
