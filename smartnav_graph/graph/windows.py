@@ -18,7 +18,7 @@ class Window:
     kind : ``first`` (t0 == t1, the first keyframe), ``normal``, ``gap`` (missing or bridged inertial data), ``static``
     dt (m,) s, accel (m, 3) m/s^2, gyro (m, 3) rad/s : inertial intervals, means over each interval, borders
     interpolated; the force is given in body axes at the interval's start
-    rows : row indices of each aiding stream at t1
+    rows : row indices of each absolute stream at t1 (`Stream.ABSOLUTE`); a builder selects those of others by time
     delayed : rows of an earlier time that became known in this window
     """
 

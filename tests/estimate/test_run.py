@@ -153,9 +153,9 @@ def test_noisier_fixes_are_held_less(eight):
     assert loose.summary["position_sigma_m"]["median"] > 2 * tight.summary["position_sigma_m"]["median"]
 
 
-def test_fixes_that_wander_get_a_state_and_an_honest_sigma():
+def test_fixes_with_correlated_errors_get_a_state_and_a_larger_sigma():
     """Phone fixes: taken as white their covariance is several times too small."""
     session = sn.simulate("phone-car-5min", 0)
-    wandering = sn.run(session)
+    correlated = sn.run(session)
     white = sn.run(session, replace(Config(), gnss=replace(Config().gnss, correlated=False)))
-    assert wandering.summary["position_sigma_m"]["median"] > 2 * white.summary["position_sigma_m"]["median"]
+    assert correlated.summary["position_sigma_m"]["median"] > 2 * white.summary["position_sigma_m"]["median"]

@@ -26,7 +26,7 @@ def states(session: sn.Session, **options) -> dict:
     return sn.run(session, Config(gnss=GnssConfig(**options))).summary["states"]
 
 
-def test_a_clock_offset_is_found_and_its_sigma_is_honest(car):
+def test_a_clock_offset_is_found_and_its_sigma_is_consistent(car):
     found = states(car)["gnss_time_offset_s"]
     assert not found["held"] and found["sigma"] < 0.02
     assert abs(found["value"] - 0.15) < 3 * found["sigma"]

@@ -1,4 +1,4 @@
-"""What every builder owes: zero at the truth, honest derivatives and sigmas, causality, no broken numbers.
+"""What every builder owes: zero at the truth, true derivatives and sigmas, causality, only finite numbers.
 
 Here the native factors; `test_contract_rows` has the kinds that GTSAM lacks. A new sensor adds its row to one of the
 tables, or these tests fail.
@@ -27,9 +27,9 @@ from smartnav_graph.session.calibration.model import DEVICE_CLASSES
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation.trajectory import Truth
 
-# Largest |component| of the honest residual, and sensors (tags) the builder speaks for.
+# Largest |component| of the residual at the truth, and sensors (tags) the builder speaks for.
 #   imu: rad, m, m/s after 1 s (second order integration of 100 Hz samples); positions: rounding.
-HONEST = {
+AT_TRUTH = {
     "imu": np.array([3e-4] * 3 + [3e-4] * 3 + [6e-4] * 3),
     "gnss": np.full(3, 1e-9),
     "control": np.full(3, 1e-9),
@@ -59,23 +59,23 @@ def residuals(graph: Graph, *sensors: str) -> np.ndarray:
 
 
 def test_every_builder_stands_in_the_tables():
-    assert set(HONEST) == set(TAGS) == {m.sensor for m in MUTATIONS}
-    assert set(FACTORS) - {"prior"} == set(HONEST) | set(CASES) | ELSEWHERE
+    assert set(AT_TRUTH) == set(TAGS) == {m.sensor for m in MUTATIONS}
+    assert set(FACTORS) - {"prior"} == set(AT_TRUTH) | set(CASES) | ELSEWHERE
 
 
-@pytest.mark.parametrize("sensor", HONEST)
+@pytest.mark.parametrize("sensor", AT_TRUTH)
 def test_the_residual_at_the_simulated_truth_is_zero(sensor, graph):
     found = np.abs(residuals(graph, sensor)).max(axis=0)
-    assert (found <= HONEST[sensor]).all(), found
+    assert (found <= AT_TRUTH[sensor]).all(), found
 
 
-@pytest.mark.parametrize("sensor", HONEST)
+@pytest.mark.parametrize("sensor", AT_TRUTH)
 def test_what_is_left_at_the_truth_is_small_beside_its_sigma(sensor, graph):
     white = np.array([factor.whitenedError(graph.values) for _, factor in graph.factors(sensor)])
     assert np.sqrt((white**2).mean()) < 0.1
 
 
-@pytest.mark.parametrize("sensor", HONEST)
+@pytest.mark.parametrize("sensor", AT_TRUTH)
 def test_one_factor_a_measurement_tagged_with_its_row(sensor, graph, recording):
     tags = [tag for tag, _ in graph.factors(sensor)]
     if sensor == "imu":
@@ -180,12 +180,12 @@ def size(rows: np.ndarray) -> float:
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.sensor}: {m.name}")
 def test_a_mistake_shows_in_the_residual(mutation, recording, graph):
-    honest = size(residuals(graph, mutation.sensor))
+    at_truth = size(residuals(graph, mutation.sensor))
     session = mutation.wrong(recording.session)
     truth = (lambda t: in_ned(recording.truth(t))) if "north-east-down" in mutation.name else recording.truth
     span = (int(recording.session.imu.t_ns[0] + SHIFT_NS), int(recording.session.imu.t_ns[-1]))
     found = size(residuals(assemble(session, truth, span=span), mutation.sensor))
-    assert honest < 1e-3 < mutation.floor < found, (honest, found)
+    assert at_truth < 1e-3 < mutation.floor < found, (at_truth, found)
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -262,7 +262,7 @@ def test_that_bound_sees_a_noise_wrong_by_forty_per_cent(tag, group, wrong):
 # --- causality and broken numbers -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sensor", HONEST)
+@pytest.mark.parametrize("sensor", AT_TRUTH)
 def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor, recording):
     session, imu = recording.session, recording.session.imu
     cut = int(imu.t_ns[1700])
@@ -281,7 +281,7 @@ def test_removing_what_comes_later_leaves_earlier_steps_unchanged(sensor, record
         np.testing.assert_array_equal(factor.whitenedError(values[0]), other.whitenedError(values[1]))
 
 
-@pytest.mark.parametrize("sensor", HONEST)
+@pytest.mark.parametrize("sensor", AT_TRUTH)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_measurement_that_is_no_number_is_refused_by_name(sensor, value, recording):
     stream = getattr(recording.session, sensor)

@@ -1,4 +1,4 @@
-"""What every builder of blocks owes: zero at the truth, honest derivatives and sigmas, causality, no broken numbers.
+"""What every builder of blocks owes: zero at the truth, true derivatives and sigmas, causality, only finite numbers.
 
 Everything runs over CASES, in units of sigma; a new sensor adds its row, or `test_contract` fails.
 """
@@ -37,7 +37,7 @@ MEMORY = PassState(stage=LAST_STAGE)
 class Case:
     """One builder.
 
-    record : its recording, exact for None, noisy for a seed; honest : largest |component| at the truth, in sigma
+    record : its recording, exact for None, noisy for a seed; at_truth : largest |component| there, in sigma
     mutations : name -> (mistake, rms over the rows it must exceed, in sigma); known : true session states
     stream : stream and field whose broken numbers are refused; noisy : whether its sigma is that of simulated noise
     options : sections of the configuration, for a factor that is off by default
@@ -45,7 +45,7 @@ class Case:
     """
 
     record: Record
-    honest: float
+    at_truth: float
     mutations: Mapping[str, tuple[Wrong, float]]
     known: Mapping[str, Any] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -379,7 +379,7 @@ def rms(rows: np.ndarray) -> float:
 def test_the_residual_at_the_simulated_truth_is_zero(sensor):
     rows = white(graph_of(sensor), sensor)
     assert len(rows) >= 15
-    assert np.abs(rows).max() <= CASES[sensor].honest
+    assert np.abs(rows).max() <= CASES[sensor].at_truth
 
 
 @pytest.mark.parametrize(("sensor", "name"), MISTAKES)
@@ -388,7 +388,7 @@ def test_a_mistake_shows_in_the_residual(sensor, name):
     wrong, floor = case.mutations[name]
     made = case.record(None)
     found = rms(white(case.graph(made, wrong(made.session)), sensor))
-    assert found > floor > 2 * case.honest, found
+    assert found > floor > 2 * case.at_truth, found
 
 
 def disturbed(graph: Graph, factor: Any) -> gtsam.Values:

@@ -1,4 +1,4 @@
-"""Bridges across gaps: what honest stretches teach, and what they promise."""
+"""Bridges across gaps: what recorded stretches predict, and with what noise."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def test_the_noise_is_what_unseen_gaps_turn_out_to_cost(noise):
     error = np.array([found[gap.start_ns].expected[0] - mean(imu, gap) for gap in gaps])
     cost = np.sqrt((error**2).mean(axis=0) * gaps[0].length_s)  # as a density
     whole = found[gaps[0].start_ns].over(gaps[0].length_s)
-    told = np.concatenate([whole.accel, whole.gyro])
-    np.testing.assert_allclose(told, cost, rtol=0.5)
+    predicted = np.concatenate([whole.accel, whole.gyro])
+    np.testing.assert_allclose(predicted, cost, rtol=0.5)
 
 
-def wandering(seconds: float, seed: int) -> Imu:
-    """Force ahead and to the left wander by 0.6 m/s^2/sqrt(s) and are drawn back within 20 s; the yaw rate is a tenth
+def drifting(seconds: float, seed: int) -> Imu:
+    """Force ahead and to the left is a Gauss-Markov process of 0.6 m/s^2/sqrt(s) and 20 s; the yaw rate is a tenth
     of the force to the left; white noise of 0.05 m/s^2/sqrt(Hz) upwards. 50 Hz."""
     rng = np.random.default_rng(seed)
     n, dt = round(50 * seconds), 0.02
@@ -84,8 +84,8 @@ def wandering(seconds: float, seed: int) -> Imu:
     return Imu(t_ns=ns_from_seconds(np.arange(n) * dt), accel=accel, gyro=gyro)
 
 
-def test_what_wanders_is_told_from_what_shakes_and_what_goes_together():
-    imu = wandering(900.0, 3)
+def test_random_walk_white_noise_and_correlation_are_separated():
+    imu = drifting(900.0, 3)
     found = bridges(imu, [hole(imu, 20_000, 150)], NOISE)[int(imu.t_ns[20_000])]
     q = found.diffusion
     np.testing.assert_allclose(np.sqrt(np.diag(q)[:2]), 0.6, rtol=0.25)
@@ -124,7 +124,7 @@ def test_vibration_is_averaged():
     assert (found.accel < 0.3 * line).all() and (found.gyro < 0.03 * line).all()
 
 
-def test_a_bridge_is_never_surer_than_honest_data():
+def test_a_bridge_has_at_least_the_noise_of_recorded_data():
     imu = Imu(
         t_ns=ns_from_seconds(np.arange(6000) / 100),
         accel=np.tile([0.0, 0.0, GRAVITY], (6000, 1)),
@@ -137,7 +137,7 @@ def test_a_bridge_is_never_surer_than_honest_data():
     np.testing.assert_allclose(found.expected[0], [0, 0, GRAVITY, 0, 0, 0], atol=1e-6)
 
 
-def test_what_stands_inside_a_gap_teaches_nothing():
+def test_samples_inside_a_gap_have_no_influence():
     imu = swinging(noise=0.5)
     gap, other = hole(imu, 5000, 160), hole(imu, 5200, 160)
     wild = np.array(imu.accel)

@@ -1,4 +1,4 @@
-"""The wandering error of code receivers: its place in the residual, its derivative, its stationary statistics."""
+"""The correlated error of code receivers: its place in the residual, its derivative, its stationary statistics."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from smartnav_graph.simulation.fixes import gauss_markov
 from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
 
 NOISE = GnssNoise(correlated_horizontal_sigma=4.0, correlated_vertical_sigma=6.0, correlated_time=60.0)
-WANDERING = PassState(correlated=frozenset({"gnss"}))
+CORRELATED = PassState(correlated=frozenset({"gnss"}))
 
 
 @pytest.fixture(scope="module")
 def graph():
     recording = record()
-    made = assemble(recording.session, recording.truth, pass_state=WANDERING)
+    made = assemble(recording.session, recording.truth, pass_state=CORRELATED)
     rng = np.random.default_rng(0)
     for window in made.windows:
         made.values.update(key("C", window.index), rng.uniform(-5, 5, 3))
@@ -42,10 +42,10 @@ def test_every_fix_is_a_row_of_a_block_and_every_keyframe_has_its_state(graph):
     assert {block.sensor for block in blocks(graph)} == {"gnss"}
     assert [list(update.chain) for update in graph.updates] == [[key("C", w.index)] for w in graph.windows]
     assert len(graph.factors("gnss_correlated_error")) == len(graph.windows)
-    assert len(graph.factors("control")) == 6  # surveyed points do not wander
+    assert len(graph.factors("control")) == 6  # errors of surveyed points are independent
 
 
-def test_the_residual_at_the_truth_is_the_wander_over_sigma(graph):
+def test_the_residual_at_the_truth_is_the_correlated_error_over_sigma(graph):
     for block in blocks(graph):
         c = graph.values.atVector(block.keys[0][2])
         np.testing.assert_allclose(custom_factor(block, 0, {}).whitenedError(graph.values), c / 1.0, atol=1e-9)
@@ -56,8 +56,8 @@ def test_the_lever_arm_sign_shows(graph):
     wrong = block.data.copy()
     wrong[:, 3:6] *= -1
     poses = [graph.values.atPose3(block.keys[0][0]).matrix()[None], np.zeros((1, 3)), np.zeros((1, 3))]
-    honest, flipped = (block.model.linearize(poses, data)[0] for data in (block.data, wrong))
-    assert np.linalg.norm(honest) < 1e-9 and np.linalg.norm(flipped) > 1.9 * np.linalg.norm(LEVER)
+    right, flipped = (block.model.linearize(poses, data)[0] for data in (block.data, wrong))
+    assert np.linalg.norm(right) < 1e-9 and np.linalg.norm(flipped) > 1.9 * np.linalg.norm(LEVER)
 
 
 def test_the_analytic_derivative_is_the_numerical_one(graph):
@@ -116,7 +116,7 @@ def test_the_process_is_stationary_with_an_exponential_correlation():
     np.testing.assert_allclose(found[:, 0, :, 1], 0.0, atol=1e-12)
 
 
-def test_simulated_wander_has_the_cost_of_its_degrees_of_freedom():
+def test_simulated_correlated_errors_have_the_cost_of_its_degrees_of_freedom():
     t = np.cumsum(np.random.default_rng(0).uniform(0.2, 5.0, 200))
     rows = gauss_markov(ns_from_seconds(t), 4.0, 60.0, np.random.default_rng(1))  # vertical 1.5 times as large
     square = 2 * chain(t).error(values_of(rows))
@@ -125,7 +125,7 @@ def test_simulated_wander_has_the_cost_of_its_degrees_of_freedom():
     assert not low < 2 * chain(t).error(values_of(1.3 * rows)) < high
 
 
-# --- who wanders ------------------------------------------------------------------------------------------------------
+# --- which fixes have it ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_simulated_wander_has_the_cost_of_its_degrees_of_freedom():
         (3.0, NOISE, GnssConfig(correlated=False), False),
     ],
 )
-def test_fixes_of_metres_wander(sigma, noise, config, expected):
+def test_fixes_of_metres_have_a_correlated_error(sigma, noise, config, expected):
     n = 4
     fixes = PositionBuilder(
         "gnss", np.zeros((n, 3)), np.full((n, 3), sigma), np.ones(n, dtype=bool), np.zeros(3), config, noise

@@ -196,7 +196,7 @@ def test_scale_and_misalignment_are_found_within_their_sigma(recovered):
         assert sigma[[0, 17]].max() < 0.25 * SIGMA  # the scale along the way, and that of the turns
 
 
-def test_their_sigmas_are_honest(recovered):
+def test_their_sigmas_are_consistent(recovered):
     square = 0.0
     for S, summary in recovered:
         state = summary["states"][imu_intrinsics.NAME]

@@ -139,7 +139,7 @@ def test_a_point_is_searched_to_the_end(problem):
     assert FOCAL * SIGMA > 100.0
 
 
-def test_tracks_join_once_they_are_judged(problem):
+def test_tracks_join_once_they_are_tested_for_outliers(problem):
     builder = smart(problem)
     for pass_state in (PassState(stage=1), replace(IN_FORCE, phase=Phase.CAUSAL)):
         assert not any(step.factors for step in steps(problem, builder, pass_state))

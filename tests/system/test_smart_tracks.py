@@ -100,7 +100,7 @@ def test_tracks_of_something_else_are_refused(room):
     assert errors(found.solution, room.reference)[0] <= 1.1 * errors(alone.solution, room.reference)[0]
 
 
-def test_without_pairs_tracks_are_judged_by_the_rest_alone(room):
+def test_without_pairs_tracks_are_tested_by_the_other_sensors_alone(room):
     """Half a minute of a phone's accelerometer is too poor: refused, and reported."""
     found = smooth(room, options(image_pairs={"enabled": False}))
     assert any("smart: refused, only" in text for text in found.summary["warnings"])

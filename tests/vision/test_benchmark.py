@@ -159,8 +159,8 @@ def test_public_recordings(dataset):
         assert found.median_matches == pytest.approx(matches, rel=0.1)
 
 
-def test_standing_still_is_judged_by_rotation(dataset):
-    """The robot on its stand: no baseline to speak of, and nearly every match stays in its place."""
+def test_a_standstill_is_evaluated_by_rotation(dataset):
+    """The robot on its stand: hardly any baseline, and nearly every match stays in its place."""
     folder = dataset("euroc_v101")
     session = sn.load(folder)
     truth = sn.load_reference(folder / "groundtruth_openvins" / "V1_01_easy.csv")

@@ -93,23 +93,23 @@ def test_sharpness_does_not_depend_on_exposure_or_noise():
         assert images.sharpness(other) == pytest.approx(images.sharpness(PICTURE), rel=0.1)
 
 
-def test_blur_is_judged_against_the_rest_and_a_picture_twice_is_one_too_many(tmp_path):
-    judge = PictureChecker()
+def test_blur_is_relative_to_the_rest_and_a_picture_twice_is_one_too_many(tmp_path):
+    checker = PictureChecker()
     where = picture(tmp_path, None)
 
     def faults(*values: float, mark: str = "") -> list[str]:
         return [
-            judge.fault(where, OpenedPicture(PICTURE, "", value, f"{mark}{i}".encode()))
+            checker.fault(where, OpenedPicture(PICTURE, "", value, f"{mark}{i}".encode()))
             for i, value in enumerate(values)
         ]
 
     assert faults(0.05, 0.15, 0.14, 0.15, 0.15, 0.16) == [""] * 6  # nothing to compare the first with
     assert faults(*[0.05] * 4, mark="b") == [images.BLURRED] * 4
     assert faults(0.15, mark="c") == [""]
-    assert judge.fault(where, OpenedPicture(PICTURE, "", 0.15, b"c0")) == images.REPEATED
-    assert judge.fault(where, OpenedPicture(fault=images.DARK)) == images.DARK
+    assert checker.fault(where, OpenedPicture(PICTURE, "", 0.15, b"c0")) == images.REPEATED
+    assert checker.fault(where, OpenedPicture(fault=images.DARK)) == images.DARK
     elsewhere = Picture(9, 0, "cam1", "", tmp_path)
-    assert judge.fault(elsewhere, OpenedPicture(PICTURE, "", 0.02, b"c0")) == ""  # another camera
+    assert checker.fault(elsewhere, OpenedPicture(PICTURE, "", 0.02, b"c0")) == ""  # another camera
 
 
 def test_thinning_keeps_the_rate_of_each_camera(tmp_path):

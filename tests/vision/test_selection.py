@@ -46,7 +46,7 @@ def test_a_sigma_stated_too_large_lets_no_plane_pass_for_depth(rng):
     )  # the noise as stated
 
 
-def test_whether_there_is_a_baseline_is_judged_by_the_sigma_stated(rng):
+def test_whether_there_is_a_baseline_depends_on_the_sigma_stated(rng):
     reported = models(rng, truth="general", variance=0.1, miss=0.6)
     assert select_model({**reported, "planar": ModelFit(np.full(200, 50.0))}) in ("static", "rotation")
 

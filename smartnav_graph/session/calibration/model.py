@@ -235,8 +235,10 @@ class Calibration:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        noises = (self.imu_noise, self.gnss_noise, self.pose_fix_noise, self.barometer_noise, self.step_noise)
-        for part in (*noises, self.range_noise, self.control_noise, self.velocity_noise):
+        noises = (getattr(self, f.name) for f in dataclasses.fields(self) if f.name.endswith("_noise"))
+        for part in noises:
+            if hasattr(part, "__post_init__"):
+                continue  # it checks itself
             for f in dataclasses.fields(part):
                 value = getattr(part, f.name)
                 may_be_zero = f.name.endswith("_sigma") and f.name.startswith(("correlated_", "bias_"))

@@ -67,7 +67,7 @@ def test_without_outliers_the_start_is_found_from_any_heading(seed, turned_deg):
     [[0], [1, 8, 20], [3, 5, 9, 14, 18, 22, 27, 33], list(range(12, 19))],
     ids=["the first", "three", "a fifth", "a burst"],
 )
-def test_outliers_are_told_exactly(seed, off):
+def test_exactly_the_outliers_are_found(seed, off):
     *given, truth = case(seed, off)
     best = align_in_motion(*given, truth, ROUND)[0]
     assert np.flatnonzero(best.outside).tolist() == off
@@ -91,7 +91,7 @@ def test_alike_starts_count_once_and_the_cheapest_comes_first():
         assert not np.array_equal(one.outside, other.outside) or angle_deg(one.R, other.R) > 10.0
 
 
-def test_many_fixes_are_thinned_and_all_judged():
+def test_many_fixes_are_thinned_and_all_tested():
     windows, at, fixes, truth = case(1)
     curve = curve_of(windows, np.zeros(6), NOISE, BIAS_SIGMA)
     rows = np.repeat(np.arange(len(at)), 20)

@@ -50,6 +50,14 @@ def test_faults_name_file_key_and_value(data, parts):
         assert part in str(e.value)
 
 
+@pytest.mark.parametrize("part", [f.name for f in dataclasses.fields(Calibration) if f.name.endswith("_noise")])
+def test_every_noise_refuses_a_negative_number(part):
+    for f in dataclasses.fields(getattr(Calibration(), part)):
+        if isinstance(getattr(getattr(Calibration(), part), f.name), float):
+            with pytest.raises(CalibrationError, match=f.name):
+                model.calibration_from_dict({part: {f.name: -1.0}})
+
+
 def test_files(tmp_path):
     path = tmp_path / "calibration.toml"
     with pytest.raises(CalibrationError, match=r"calibration.toml: cannot be read \(No such file or directory\)"):
