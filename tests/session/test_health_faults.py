@@ -140,7 +140,7 @@ FAULTS = [
     (WALK, scaled("imu", "gyro", np.pi / 180), "converted from deg to rad twice", "multiply gyro by 180/pi"),
     (CAR, scaled("imu", "gyro", 180 / np.pi), "it looks like deg/s", "multiply gyro by pi/180"),
     (CAR, scaled("imu", "accel", 1 / 9.80665), "units of g", "multiply accel by 9.80665"),
-    (CAR, scaled("imu", "accel", -1.0), "specific force points up", "flip the sign of accel"),
+    (CAR, scaled("imu", "accel", -1.0), "specific force points 17", "flip the sign of accel"),
     (CAR, frozen_imu, "imu: repeats one row of readings for 3.0 s in 1 stretch", "count as a gap"),
     (CAR, dead_axis, "imu: gyro y is 0 in all", "import the log again"),
     (CAR, clipped, "|accel| is 19.61 in", "larger range"),

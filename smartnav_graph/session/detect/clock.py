@@ -32,6 +32,7 @@ _OVERLAP_S = 10.0  # of both sensors, at least
 _WINDOWS = ((20.0, 3), (40.0, 5))  # length, s, and degree of the polynomial
 _SPACING_S = 0.95  # between fixes that are used
 _COARSE_S, _FINE_S = 0.25, 0.02
+_LONG_SEARCH_S = 3600.0  # more lags than that in steps twice as long
 _MOST_FIXES = 600  # of the search; the refinement takes all
 _LONG_CHORD_S, _BLOCK_S = 4.0, 60.0
 _MOST_RATE = 0.02  # rad/s
@@ -109,10 +110,13 @@ class FixTrack:
         return found
 
     def busiest(self, count: int) -> FixTrack:
-        """The `count` fixes in a row with the longest way."""
+        """The `count` fixes in a row with most acceleration and turns."""
         if len(self) <= count:
             return self
-        way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.position)))])
+        p = self.position
+        bent = np.abs(p[8:] - 2.0 * p[4:-4] + p[:-8])
+        way = np.concatenate([np.zeros(5), np.cumsum(np.minimum(bent, 5.0 * np.median(bent) + 1e-9)), np.zeros(4)])
+        way[-4:] = way[-5]
         first = int(np.argmax(way[count - 1 :] - way[: len(way) - count + 1]))
         return FixTrack(self.t[first : first + count], self.position[first : first + count])
 
@@ -173,6 +177,13 @@ def shape_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Floats
     return np.asarray(np.mean(sums, axis=0)) if sums else None
 
 
+def still_score(fixes: FixTrack) -> float:
+    """`shape_score` of inertial data that see no motion."""
+    steps = np.zeros(2)
+    score = shape_score(InertialMotion(0, steps, steps.astype(np.complex128)), fixes, np.zeros(1))
+    return -np.inf if score is None else float(score[0])
+
+
 def _peak(score: Floats, lags: Floats) -> tuple[int, float]:
     """Index of the best lag, and how far its score exceeds that of any lag `_PEAK_S` away."""
     best = int(np.argmax(score))
@@ -191,8 +202,8 @@ def find_clock_offset(sensor: str, motion: InertialMotion, fixes: FixTrack) -> C
     first, last = part.t[0] - motion.length_s + _OVERLAP_S, part.t[-1] - _OVERLAP_S
     if first >= last:
         return None
-    # zero is one of the lags, where it is inside
-    lags = np.arange(np.ceil(first / _COARSE_S), np.floor(last / _COARSE_S) + 1) * _COARSE_S
+    step = _COARSE_S if last - first < _LONG_SEARCH_S else 2.0 * _COARSE_S
+    lags = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
     course = course_score(motion, part, lags)
     shape = shape_score(motion, part, lags)
     if shape is None:

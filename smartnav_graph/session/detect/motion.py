@@ -48,12 +48,11 @@ class InertialMotion:
         return len(self.heading) * STEP_S
 
 
-def levelled_motion(imu: Imu, gyro_signs: tuple[int, int, int] = (1, 1, 1)) -> InertialMotion | None:
-    """Motion by the inertial data, the axes of gyro with these signs; None for less than 10 s or more than a day."""
+def levelled_motion(imu: Imu) -> InertialMotion | None:
+    """Motion by the inertial data; None for less than 10 s or more than a day."""
     if not _LENGTH_S[0] < (int(imu.t_ns[-1]) - int(imu.t_ns[0])) / NS < _LENGTH_S[1]:
         return None
     gyro, accel = step_means(imu)
-    gyro = gyro * gyro_signs
     gyro -= _constant_bias(gyro, accel)
     R = _attitude(gyro)
     force = R.apply(accel)
@@ -86,23 +85,25 @@ def step_means(imu: Imu) -> tuple[Floats, Floats]:
 
 def _attitude(gyro: Floats) -> Rotation:
     """Attitude (n,) in the middle of each step, in a frame that does not turn: products of all turns before."""
-    n = len(gyro)
-    block = max(1, round(np.sqrt(n)))
-    turns = np.zeros((-(-n // block) * block, 3))
-    turns[:n] = gyro * STEP_S
-    turns = turns.reshape(-1, block, 3)
-    q = np.empty((*turns.shape[:2], 4))
-    inside = Rotation.identity(len(turns))
-    for k in range(block):  # all blocks at once
-        inside = inside * Rotation.from_rotvec(turns[:, k])
-        q[:, k] = inside.as_quat()
-    start, starts = Rotation.identity(), []
-    for last in inside:
-        starts.append(start)
-        start = start * last
-    before = Rotation.concatenate(starts).as_quat()
-    whole = Rotation.from_quat(np.repeat(before, block, axis=0)[:n]) * Rotation.from_quat(q.reshape(-1, 4)[:n])
-    return whole * Rotation.from_rotvec(-0.5 * STEP_S * gyro)
+    q = Rotation.from_rotvec(STEP_S * gyro).as_quat().T.copy()
+    count = 1
+    while count < q.shape[1]:  # each holds the product of `count` turns
+        q[:, count:] = _product(q[:, :-count], q[:, count:])
+        count *= 2
+    return Rotation.from_quat(_product(q, Rotation.from_rotvec(-0.5 * STEP_S * gyro).as_quat().T).T)
+
+
+def _product(p: Floats, q: Floats) -> Floats:
+    """Product (4, n) of quaternions x y z w."""
+    (a, b, c, d), (x, y, z, w) = p, q
+    return np.stack(
+        [
+            d * x + a * w + b * z - c * y,
+            d * y - a * z + b * w + c * x,
+            d * z + a * y - b * x + c * w,
+            d * w - a * x - b * y - c * z,
+        ]
+    )
 
 
 def _vertical(force: Floats, width_s: float) -> Floats:

@@ -1,7 +1,7 @@
 """Checks of a recorded session before anything is estimated: rates, gaps, units, signs, overlaps.
 
 Nothing is repaired here. Every rule is a small generator of findings; `RULES` lists them: those of any stream in
-`streams`, of the inertial stream in `inertial`, of positions in `positions`, of the other sensors in `sensors`.
+`streams`, of the inertial stream in `inertial` and `axes`, of positions in `positions`, of the others in `sensors`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import Gap, find_gaps, seconds_since
-from smartnav_graph.session.health import inertial, positions, sensors
+from smartnav_graph.session.health import axes, inertial, positions, sensors
 from smartnav_graph.session.health import streams as all_streams
 from smartnav_graph.session.health.clocks import ClockReport, compare_clocks
 from smartnav_graph.session.health.facts import AIDING, Facts, Finding
@@ -126,6 +126,7 @@ def _stream_health(session: Session, name: str, stream: Stream) -> StreamHealth:
 RULES: tuple[Callable[[Facts], Iterator[Finding]], ...] = (
     *all_streams.RULES,
     *inertial.RULES,
+    *axes.RULES,
     *positions.RULES,
     *sensors.RULES,
     all_streams.dropped,

@@ -1,4 +1,4 @@
-"""Clocks of the position sensors against the inertial data; see `detect.clock`. Not a rule of `inspect`: it is applied
+"""Clocks and axes of the position sensors against the inertial data; see `detect.clock`, `detect.axes`. Not a rule of `inspect`: it is applied
 before, and what it finds is among the findings."""
 
 from __future__ import annotations
@@ -6,8 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from smartnav_graph.core.timebase import LEAP_SECONDS, NS
+from smartnav_graph.session.detect.axes import find_axes_fault
 from smartnav_graph.session.detect.clock import ClockOffset, FixTrack, find_clock_offset
 from smartnav_graph.session.detect.motion import levelled_motion
+from smartnav_graph.session.health.axes import axes_finding
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 
@@ -19,10 +21,18 @@ _SENSORS = ("gnss", "pose_fixes")
 
 @dataclass(frozen=True)
 class ClockReport:
-    """What a comparison of the sensors' clocks finds: an offset for each sensor that could be compared."""
+    """What a comparison of the position sensors with the inertial data finds.
+
+    offsets : of each sensor that could be compared; faults : of axes and of the stamps within a stream
+    """
 
     offsets: tuple[ClockOffset, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    faults: tuple[Finding, ...] = ()
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Faults, and offsets that exceed what is estimated as a state."""
+        return (*(_late(offset) for offset in self.offsets if beyond_state(offset)), *self.faults)
 
     def to_dict(self) -> dict[str, dict[str, float | bool]]:
         """Offsets by sensor, seconds."""
@@ -45,9 +55,17 @@ def compare_clocks(session: Session) -> ClockReport:
         name: FixTrack.of(stream.t_ns, session.nav_position(stream), motion.start_ns)
         for name, stream in streams.items()
     }
-    found = [find_clock_offset(name, motion, track) for name, track in tracks.items()]
-    offsets = tuple(offset for offset in found if offset is not None)
-    return ClockReport(offsets, tuple(_late(offset) for offset in offsets if beyond_state(offset)))
+    offsets, faults = [], []
+    for name, track in tracks.items():
+        offset = find_clock_offset(name, motion, track)
+        if offset is None:
+            continue
+        offsets.append(offset)
+        lag_s = offset.lag_s if offset.known else 0.0
+        fault = find_axes_fault(session.imu, track, motion.start_ns, lag_s)
+        if fault is not None:
+            faults.append(axes_finding(session, fault))
+    return ClockReport(tuple(offsets), tuple(faults))
 
 
 def beyond_state(offset: ClockOffset) -> bool:
@@ -69,8 +87,7 @@ def apply_offsets(session: Session, report: ClockReport) -> tuple[Session, Clock
             changes[offset.sensor] = replace(stream, t_ns=stream.t_ns - shift, arrival_ns=arrival)
             offset = replace(offset, applied=True)
         offsets.append(offset)
-    findings = tuple(_late(offset) for offset in offsets if beyond_state(offset))
-    return session.replace(**changes), replace(report, offsets=tuple(offsets), findings=findings)
+    return session.replace(**changes), replace(report, offsets=tuple(offsets))
 
 
 def _late(offset: ClockOffset) -> Finding:

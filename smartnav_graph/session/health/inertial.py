@@ -8,7 +8,6 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.session.health.facts import (
@@ -81,16 +80,6 @@ def _accel_unit(facts: Facts) -> Iterator[Finding]:
         yield Finding("imu", text, "calibrate the accelerometer, or check gravity_m_s2 of the session")
 
 
-def _accel_sign(facts: Facts) -> Iterator[Finding]:
-    if facts.imu is None:
-        return
-    norm, up = float(np.median(np.linalg.norm(facts.imu.accel, axis=1))), facts.session.device.up
-    along = float((facts.imu.accel @ frames.axis_vector(up)).mean())
-    if along < -0.5 * norm:
-        text = f"accel along the up axis {up} averages {along:.3g} m/s^2, but specific force points up"
-        yield Finding("imu", text, "flip the sign of accel, or correct [device] up in session.toml")
-
-
 def _gyro_unit(facts: Facts) -> Iterator[Finding]:
     if facts.imu is None:
         return
@@ -154,15 +143,11 @@ def _median_angle_deg(imu: Imu, start: Indices, n: int, s: float, up_0: Floats, 
 
 
 def _gyro_course(facts: Facts) -> Iterator[Finding]:
-    """Turns of the course of the fixes against those of the gyro about the vertical."""
+    """Size of the turns of the course of the fixes against those of the gyro about the vertical."""
     turns = _turns(facts)
     if turns is None:
         return
     course, gyro = turns
-    correlation, slope = _fit(course, gyro, np.abs(gyro) > _CLEAR_TURN)
-    if correlation < -_CORRELATED and 0.5 < -slope < 2.0:
-        text = "gyro turns against the course of the fixes: its sign is wrong, or the fixes are mirrored"
-        yield Finding("imu", text, "flip the sign of gyro, or exchange latitude and longitude of the fixes")
     correlation, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
     if correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the fixes turn {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
@@ -228,4 +213,4 @@ def _clipped(facts: Facts) -> Iterator[Finding]:
             yield Finding("imu", text, "choose a larger range when recording; the motion there is lost")
 
 
-RULES = (_accel_unit, _accel_sign, _gyro_unit, _gyro_course, _frozen, _clipped, _gaps)
+RULES = (_accel_unit, _gyro_unit, _gyro_course, _frozen, _clipped, _gaps)
