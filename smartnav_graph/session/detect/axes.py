@@ -27,7 +27,7 @@ _DISTINCT = 3.0  # over the next hypothesis, and of the shape over inertial data
 
 @dataclass(frozen=True)
 class Axes:
-    """Recorded axes are these (3, 3) times the true ones; `mirrored` : so are the fixes. sensor, text : of the fault."""
+    """Changes of axes (3, 3) of gyro and accel; `mirrored` : so are the fixes. sensor, text : of the fault."""
 
     sensor: str
     text: str

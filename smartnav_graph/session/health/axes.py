@@ -52,7 +52,7 @@ def up_axis(facts: Facts) -> Iterator[Finding]:
 
 
 def axes_finding(session: Session, fault: AxesFault) -> Finding:
-    """The fault in words. Of hypotheses that fit alike, those that gravity along the up axis contradicts are left out."""
+    """The fault in words, without the hypotheses that gravity along the up axis contradicts."""
     up, accel = frames.axis_vector(session.device.up), session.require_imu().accel
 
     def against(axes: Axes) -> bool:

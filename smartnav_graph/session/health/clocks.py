@@ -1,5 +1,7 @@
-"""Clocks and axes of the position sensors against the inertial data; see `detect.clock`, `detect.axes`. Not a rule of `inspect`: it is applied
-before, and what it finds is among the findings."""
+"""Clocks and axes of the position sensors against the inertial data; see `detect.clock` and `detect.axes`.
+
+No rule of `inspect`: it is applied before, and what it finds is among the findings.
+"""
 
 from __future__ import annotations
 
