@@ -1,7 +1,9 @@
 """Named, counted repairs of faulty tables. Applied only on request; the file on disk is not changed.
 
 =========  ==========================================================================================
-``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped
+``clock``  a clock that was set back continued by one median step (a week of GPS time added where that is it);
+           inertial rows that arrive in bursts spread evenly
+``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped; refused where a clock was set back
 ``nan``    rows with a non-finite required value dropped
 ``stamps`` jittered inertial stamps rebuilt between gaps: row order is kept, each becomes its 4 s moving mean
 =========  ==========================================================================================
@@ -15,12 +17,15 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core.arrays import Column, Indices, Mask, Table, Times
-from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import Imu
 
-REPAIRS = ("nan", "stamps", "order")
+REPAIRS = ("nan", "clock", "stamps", "order")
+_RESET_S, _RESET_ROWS = 1.0, 10  # a clock set back by less, or of fewer rows, is disorder
+_WEEK_S = 604_800
+_BURST = 0.05  # of the mean step: steps within a burst
 
 
 def check_names(names: Iterable[str]) -> tuple[str, ...]:
@@ -50,7 +55,7 @@ def repair(kind: type[Stream], table: Mapping[str, Column], names: Iterable[str]
     counts: dict[str, int] = {}
     for name in check_names(names):
         if "t_ns" in rows and len(rows["t_ns"]):
-            rows, found = {"nan": _drop_nan, "order": _sort, "stamps": _rebuild_stamps}[name](kind, rows)
+            rows, found = _STEPS[name](kind, rows)
             counts |= {reason: counts.get(reason, 0) + count for reason, count in found.items() if count}
     return rows, counts
 
@@ -75,6 +80,11 @@ def _drop_nan(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
 
 def _sort(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
     t = np.asarray(rows["t_ns"], dtype=np.int64)
+    if len(resets := clock_resets(rows)):
+        row = int(resets[0])
+        found = f"t_ns falls back by {(t[row - 1] - t[row]) / NS:.3f} s at row {row}: the clock was set back"
+        remedy = "add --repair clock to continue it; sorting would merge two parts of the recording"
+        raise SessionError(kind.NAME, found, "one clock from begin to end", remedy, row=row, stream=kind.NAME)
     moved = int((np.diff(t) < 0).sum())
     rows = _keep(rows, np.argsort(t, kind="stable"))
     repeated = 0
@@ -83,6 +93,52 @@ def _sort(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
         repeated = int((~first).sum())
         rows = _keep(rows, first)
     return rows, {"disordered rows sorted": moved, "repeated stamps dropped": repeated}
+
+
+def clock_resets(rows: Table) -> Indices:
+    """Rows (k,) at which a clock was set back: from there on rows lie between those before, or before them all, and
+    repeat none of them. Rows that are swapped, delivered twice or delivered late are no resets."""
+    t = np.asarray(rows["t_ns"], dtype=np.int64)
+    values = [np.asarray(column) for name, column in rows.items() if name != "t_ns"]
+    resets = []
+    for row in np.flatnonzero(np.diff(t) < -_RESET_S * NS) + 1:
+        order = np.argsort(t[:row], kind="stable")
+        before, late = t[:row][order], row + np.flatnonzero(t[row:] < t[:row].max())
+        at = np.searchsorted(before, t[late])
+        same = before[at] == t[late]
+        for column in values:
+            same &= column[order][at] == column[late]
+        step, most = before[at] - before[np.maximum(at - 1, 0)], 3.0 * float(np.median(np.diff(before)))
+        first = at == 0
+        apart = first & (before[0] - t[late][first].max(initial=t.min()) > most)
+        merged = ~same & np.where(first, apart, step < most)
+        if len(before) > 2 and merged.sum() >= min(_RESET_ROWS, len(t) - row) and 2 * merged.sum() > len(late):
+            resets.append(row)
+    return np.array(resets, dtype=np.intp)
+
+
+def arrives_in_bursts(t: Times) -> bool:
+    """Whether most rows follow the one before at once, as stamps of the arrival of packets do."""
+    step = np.diff(t)
+    return len(step) > 20 and bool(np.median(step) < _BURST * step.mean()) and bool(step.min() >= 0)
+
+
+def _repair_clock(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
+    t = np.asarray(rows["t_ns"], dtype=np.int64).copy()
+    resets = clock_resets(rows)
+    for row in resets:
+        back = int(t[row - 1] - t[row])
+        weeks = round(back / (_WEEK_S * NS))
+        near = weeks > 0 and abs(back - weeks * _WEEK_S * NS) < 10 * NS
+        t[row:] += weeks * _WEEK_S * NS if near else back + round(float(np.median(np.diff(t[:row]))))
+    counts = {"after a clock was set back, continued": len(t) - int(resets[0]) if len(resets) else 0}
+    if kind is Imu and arrives_in_bursts(t):
+        spacing = np.diff(t)
+        spacing = spacing[spacing > _BURST * spacing.mean()]
+        breaks = np.flatnonzero(np.diff(t) > 3.0 * np.median(spacing)) + 1
+        t = np.concatenate([_steady(part) for part in np.split(t, breaks)])
+        counts["of bursts, spread evenly"] = len(t)
+    return rows | {"t_ns": t}, counts
 
 
 def _rebuild_stamps(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
@@ -117,3 +173,6 @@ def _steady(t: Times) -> Times:
     width = max(3, round(4.0 * NS / slope)) | 1 if slope > 0 else 3
     smooth = uniform_filter1d(since - slope * rows, width, mode="reflect") + slope * rows
     return np.asarray(np.rint(smooth).astype(np.int64) + t[0], dtype=np.int64)
+
+
+_STEPS = {"nan": _drop_nan, "clock": _repair_clock, "stamps": _rebuild_stamps, "order": _sort}

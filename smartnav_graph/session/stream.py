@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Column, Floats, Indices, Mask, Table, Times
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
 
 _DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
 
@@ -108,6 +109,8 @@ class Stream:
             count = f"(step {int(step[row - 1])} ns; {len(bad)} such rows in all)"
             found = f"t_ns not {strictly}increasing at row {row} {count}"
             remedy = "correct the file, or add --repair order to sort rows and drop repeated stamps, counted"
+            if step.min() < -NS:
+                remedy += "; --repair clock where the clock was set back"
             raise self._error(found, rule, remedy, row)
         early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
         if len(early):

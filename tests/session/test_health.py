@@ -239,12 +239,26 @@ def test_noise_of_fast_fixes_is_no_jump():
     assert inspect(make_session(gnss=fixes)).warnings() == []
 
 
-@pytest.mark.parametrize(("factor", "rate"), [(1000, "0.1 Hz"), (0.001, "1e+05 Hz")])
-def test_stamps_in_another_unit(factor, rate):
+def test_stamps_too_far_apart():
     imu = make_imu()
-    t_ns = T0 + np.rint((imu.t_ns - T0) * factor).astype(np.int64)
+    t_ns = T0 + (imu.t_ns - T0) * 1000
     warnings = inspect(make_session(imu=replace(imu, t_ns=t_ns))).warnings()
-    assert any(f"median rate {rate} is outside" in warning for warning in warnings)
+    assert any("median rate 0.1 Hz is outside" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(("unit_ns", "name", "power"), [(1000, "microseconds", "1e3"), (10**6, "milliseconds", "1e6")])
+def test_stamps_in_another_unit_are_an_error(unit_ns, name, power):
+    imu, fixes = make_imu(), make_fixes()
+    small = make_session(imu=replace(imu, t_ns=imu.t_ns // unit_ns), gnss=replace(fixes, t_ns=fixes.t_ns // unit_ns))
+    with pytest.raises(SessionError, match=f"they look like {name}; multiply t_ns of every stream by {power}"):
+        inspect(small).raise_errors()
+
+
+def test_stamps_of_arrival_in_bursts_are_an_error():
+    imu = make_imu()
+    t_ns = imu.t_ns // 10**8 * 10**8 + np.arange(len(imu)) % 10 * 1000
+    with pytest.raises(SessionError, match=r"arrive in bursts: the median step is 1 us, the mean 9.97 ms.*--repair"):
+        inspect(make_session(imu=replace(imu, t_ns=t_ns))).raise_errors()
 
 
 def test_unix_clock_in_milliseconds():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session.repair import REPAIRS, check_names, repair
 from smartnav_graph.session.streams import GnssFix, Imu, Tracks
@@ -28,7 +28,7 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(one[name], other[name])
 
 
-@pytest.mark.parametrize("names", [(), ("order",), ("nan",), ("nan", "order")])
+@pytest.mark.parametrize("names", [(), ("order",), ("nan",), ("nan", "order"), ("clock",), ("clock", "order")])
 def test_a_good_table_comes_back_as_it_was(names):
     table = imu_table()
     rows, counts = repair(Imu, table, names)
@@ -138,7 +138,7 @@ def test_a_handful_of_rows_survives_every_repair():
 
 def test_names_are_checked_and_put_in_order():
     assert check_names(["order", "nan", "stamps", "nan"]) == ("nan", "stamps", "order")
-    with pytest.raises(ConfigError, match="--repair: unknown repair magic; expected some of nan, stamps, order"):
+    with pytest.raises(ConfigError, match="--repair: unknown repair magic; expected some of nan, clock, stamps, order"):
         check_names(["magic", "nan"])
 
 
@@ -147,3 +147,40 @@ def test_the_given_table_is_left_as_it_was():
     before = {k: v.copy() for k, v in table.items()}
     repair(Imu, {k: v[::-1] for k, v in table.items()}, REPAIRS)
     assert_equal(table, before)
+
+
+@pytest.mark.parametrize("back_s", [10.0, 5.0, 604_800.0])
+def test_a_clock_that_was_set_back_is_continued_never_merged(back_s):
+    """At 10 s to zero, by half of what is recorded, at the end of a week of GPS time."""
+    table = imu_table()
+    table["t_ns"] = table["t_ns"] - table["t_ns"][0] + (604_790 * NS if back_s > 1000 else 0)
+    late = np.arange(len(table["t_ns"])) >= 1000
+    reset = changed(table, t_ns=table["t_ns"] - late * round(back_s * NS))
+    with pytest.raises(SessionError, match=r"the clock was set back; .*--repair clock"):
+        repair(Imu, reset, ["order"])
+    rows, counts = repair(Imu, reset, ["clock"])
+    assert counts == {"after a clock was set back, continued": 1000}
+    np.testing.assert_allclose(rows["t_ns"], table["t_ns"], atol=20_000_000)
+
+
+def test_rows_delivered_late_or_twice_are_no_reset():
+    table = imu_table()
+    late = np.r_[0:500, 800:1200, 500:800, 1200:2000]
+    rows, counts = repair(Imu, {k: v[late] for k, v in table.items()}, ["clock", "order"])
+    assert "after a clock was set back, continued" not in counts
+    assert_equal(rows, table)
+    twice = np.r_[0:1000, 700:1000, 1000:2000]
+    rows, counts = repair(Imu, {k: v[twice] for k, v in table.items()}, ["clock", "order"])
+    assert counts["repeated stamps dropped"] == 300
+    assert_equal(rows, table)
+
+
+def test_bursts_are_spread():
+    table = imu_table()
+    true = table["t_ns"]
+    burst = true // 10**8 * 10**8 + np.arange(len(true)) % 10 * 1000
+    rows, counts = repair(Imu, changed(table, t_ns=burst), ["clock"])
+    assert counts == {"of bursts, spread evenly": len(true)}
+    # all late by the same half of a burst, but for the ends
+    off = (rows["t_ns"] - true)[300:-300] / NS
+    assert np.ptp(off) < 0.005 and abs(off.mean()) < 0.06

@@ -93,8 +93,10 @@ def inspect(session: Session, gaps: Sequence[Gap] | None = None, clocks: ClockRe
     if gaps is None:
         gaps = [] if usable is None else find_gaps(usable.t_ns, np.hstack([usable.gyro, usable.accel]))
     facts = Facts(session, tuple(gaps), None if usable is None else quiet_accel(usable))
-    clocks = clocks or compare_clocks(session)
-    findings = [*clocks.findings, *(finding for rule in RULES for finding in rule(facts))]
+    findings = list(all_streams.stamps(facts))
+    if not findings:
+        clocks = clocks or compare_clocks(session)
+        findings = [*clocks.findings, *(finding for rule in RULES for finding in rule(facts))]
     parts = {
         "imu": imu is not None,
         f"absolute sensor ({', '.join(ABSOLUTE)})": bool(session.absolute()),

@@ -9,8 +9,11 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.health.facts import AIDING, LEAST_ROWS, Facts, Finding, period
+from smartnav_graph.session.repair import arrives_in_bursts
 from smartnav_graph.session.streams import ABSOLUTE, StaticPeriod
 
+_MOST_RATE_HZ = 8000.0  # of an IMU that people have
+_UNITS = {"microseconds": 3, "milliseconds": 6, "seconds": 9}
 _UNIX_FROM, _UNIX_TO = 631_152_000 * NS, 4_102_444_800 * NS  # 1990 to 2100
 
 
@@ -33,6 +36,24 @@ def _rows(facts: Facts) -> Iterator[Finding]:
 def dropped(facts: Facts) -> Iterator[Finding]:
     for name, counts in facts.session.dropped.items():
         yield Finding(name, ", ".join(f"{count} {reason}" for reason, count in counts.items()), level="info")
+
+
+def stamps(facts: Facts) -> Iterator[Finding]:
+    """Inertial stamps that are no nanoseconds, or no times of samples: nothing else can be checked then."""
+    imu = facts.session.imu
+    if imu is None or len(imu) < LEAST_ROWS:
+        return
+    step = float(imu.t_ns[-1] - imu.t_ns[0]) / (len(imu) - 1)
+    if step < NS / _MOST_RATE_HZ:
+        fits = [(unit, power) for unit, power in _UNITS.items() if NS / _MOST_RATE_HZ <= step * 10**power <= NS]
+        looks = f": they look like {fits[0][0]}" if fits else ""
+        remedy = f"multiply t_ns of every stream by 1e{fits[0][1]}" if fits else "give t_ns in nanoseconds"
+        text = f"{len(imu)} stamps of t_ns lie {step:.4g} ns apart on the mean{looks}"
+        yield Finding("imu", text, remedy, "error")
+    elif arrives_in_bursts(imu.t_ns):
+        short = float(np.median(np.diff(imu.t_ns)))
+        text = f"rows arrive in bursts: the median step is {short / 1e3:.3g} us, the mean {step / 1e6:.4g} ms"
+        yield Finding("imu", text, "give the times of the samples, or add --repair clock to spread them", "error")
 
 
 def _clock(facts: Facts) -> Iterator[Finding]:
