@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from smartnav_graph.core.timebase import LEAP_SECONDS, NS
 from smartnav_graph.session.detect.axes import find_axes_fault
 from smartnav_graph.session.detect.clock import ClockOffset, FixTrack, find_clock_offset
+from smartnav_graph.session.detect.clock_changes import ClockChange, find_clock_change
 from smartnav_graph.session.detect.motion import levelled_motion
 from smartnav_graph.session.health.axes import axes_finding
 from smartnav_graph.session.health.facts import Finding
@@ -62,11 +63,14 @@ def compare_clocks(session: Session) -> ClockReport:
         offset = find_clock_offset(name, motion, track)
         if offset is None:
             continue
-        offsets.append(offset)
         lag_s = offset.lag_s if offset.known else 0.0
         fault = find_axes_fault(session.imu, track, motion.start_ns, lag_s)
         if fault is not None:
             faults.append(axes_finding(session, fault))
+        elif change := find_clock_change(motion, track, lag_s):
+            offset = replace(offset, known=False)
+            faults.append(_changing(name, change, motion.start_ns))
+        offsets.append(offset)
     return ClockReport(tuple(offsets), tuple(faults))
 
 
@@ -98,6 +102,18 @@ def _late(offset: ClockOffset) -> Finding:
     name = _name(offset.lag_s)
     remedy = "corrected for this run" if offset.applied else "`smartnav smooth` corrects it; better mend the stamps"
     return Finding(offset.sensor, text + (f": {name}" if name else ""), remedy, size=offset.lag_s)
+
+
+def _changing(sensor: str, change: ClockChange, start_ns: int) -> Finding:
+    at_ns = start_ns + round(change.at_s * NS)
+    if change.is_rate:
+        way = "slow" if change.size > 0 else "fast"
+        text = f"clock runs {100 * abs(change.size):.1f} % {way} against that of {sensor}"
+        remedy = f"multiply the time since its first row by {1.0 + change.size:.3f}"
+        return Finding("imu", text, remedy, size=round(change.size, 4), start_ns=at_ns)
+    text = f"stamps jump by {change.size:+.1f} s against the motion of the IMU, {change.at_s:.0f} s after its start"
+    remedy = "correct the stamps from there on, or smooth both parts alone (--from, --to)"
+    return Finding(sensor, text, remedy, size=round(change.size, 1), start_ns=at_ns)
 
 
 def _name(lag_s: float) -> str:
