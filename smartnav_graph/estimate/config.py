@@ -47,7 +47,7 @@ class RunConfig:
     end_s: float | None = None
     initial: str = ""
     rate: str = "keyframes"
-    passes: int = 8
+    passes: int = 14
 
     def __post_init__(self) -> None:
         if self.vehicle and self.vehicle not in VEHICLES:

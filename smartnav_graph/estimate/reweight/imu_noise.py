@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.factors import imu_intrinsics
@@ -38,8 +39,8 @@ LEAST_REDUNDANCY = 4.0
 MOST = 5.0
 # No device is a factor of more than this from what is known of its class.
 WIDEST = 10.0
-# Normalised square at which fixes contradict their sigma.
-CONTRADICTION = 2.0
+# A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
+SURPRISE = 1e-4
 # The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.
 RELAXATION = 1.5
 # Groups of noise and their fields in `calibration.model.ImuNoise`.
@@ -58,15 +59,14 @@ class Component(NamedTuple):
     square: float
     redundancy: float
 
-    def scale(self, before: float, weight: float, level: float = 1.0) -> float:
-        """The next scale of the group's sigma.
+    @property
+    def is_known(self) -> bool:
+        """Whether the data say enough of this group: by their number, or by how far off they are."""
+        return self.redundancy >= LEAST_REDUNDANCY or self.square > chi2.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
 
-        weight : what the noise known before (scale 1) counts for; level : normalised square of the fixes. Where they
-        contradict their own sigma more than the group does, they bend the solution, and the noise is not to blame.
-        """
-        blamed = level < CONTRADICTION or self.square > level * self.redundancy
-        square = self.square if blamed else min(self.square, self.redundancy)
-        wanted = np.sqrt((before**2 * square + weight) / (self.redundancy + weight))
+    def scale(self, before: float, weight: float) -> float:
+        """The next scale of the group's sigma; weight : what the noise known before (scale 1) counts for."""
+        wanted = np.sqrt((before**2 * self.square + weight) / (self.redundancy + weight))
         if abs(np.log(wanted / before)) < 0.5 / np.sqrt(2.0 * (self.redundancy + weight)):
             return before  # half of what the data leave open
         step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
@@ -86,7 +86,7 @@ class _Factors(NamedTuple):
         """Of one part (m, 9, 9) of the covariances."""
         white = self.root @ part @ self.root.transpose(0, 2, 1)
         square = np.einsum("ni,nij,nj->", self.residual, white, self.residual)
-        return Component(float(square), float(np.einsum("nij,nji->", white, self.left)))
+        return Component(float(square), max(float(np.einsum("nij,nji->", white, self.left)), 0.0))
 
 
 def components(
@@ -152,7 +152,8 @@ def _white(builder: ImuBuilder, factors: _Factors, pass_state: PassState) -> dic
     other = factors.component(integration_part(factors.windows, builder.config.integration_sigma))
     redundancy = float(np.trace(factors.left, axis1=1, axis2=2).sum())
     square = float((factors.residual**2).sum())
-    gyro = Component(square - accel.square - other.square, redundancy - accel.redundancy - other.redundancy)
+    left = max(redundancy - accel.redundancy - other.redundancy, 0.0)
+    gyro = Component(square - accel.square - other.square, left)
     return {"accel": accel, "gyro": gyro}
 
 
@@ -176,15 +177,13 @@ def noise_scales(
     windows: Sequence[Window],
     estimate: Estimate,
     pass_state: PassState,
-    level: float = 1.0,
 ) -> dict[str, float]:
-    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of; `level` is the
-    normalised square of the fixes."""
+    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of."""
     builder = next((b for b in builders if isinstance(b, ImuBuilder) and b.config.estimate_noise), None)
     if builder is None or len(windows) < 2:
         return {}
     return {
-        name: part.scale(pass_state.scale(name), builder.weight, level)
+        name: part.scale(pass_state.scale(name), builder.weight)
         for name, part in components(builder, windows, estimate, pass_state).items()
-        if part.redundancy >= LEAST_REDUNDANCY
+        if part.is_known
     }

@@ -49,7 +49,7 @@ SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
 # have few degrees of freedom and change slowly.
 STEADY = 0.1
-STEADY_INERTIAL = 0.1
+STEADY_INERTIAL = float(np.log(1.5))
 
 
 # Growth of mu a pass, and the most passes that takes.
@@ -100,13 +100,12 @@ def _update_noise_and_fixes(
     if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
     steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in found)
-    tuned, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
-    if pass_state.stage == LAST_STAGE:
-        new, steady = tuned, steady and calm
+    new, calm = _inertial(builders, windows, estimate, pass_state, new)
+    steady = steady and calm
     if not (steady and new.rejected == pass_state.rejected):
         return new, False
-    grown = enable_second_stage(builders, estimate, tuned)
-    return grown, grown == tuned
+    grown = enable_second_stage(builders, estimate, new)
+    return grown, grown == new
 
 
 def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float) -> PassState:
@@ -164,37 +163,23 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=correlated)
 
 
-def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
-    """Normalised square of the fixes in use over their redundancy, at least 1."""
-    square = redundancy = 0.0
-    for name, (_, one) in found.items():
-        used = pass_state.used(name, one.rows)
-        square += float(one.square[used].sum())
-        redundancy += float(one.redundancy[used].sum())
-    return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
-
-
 def _inertial(
     builders: Sequence[Builder],
     windows: Sequence[Window],
     estimate: Estimate,
     pass_state: PassState,
     new: PassState,
-    level: float,
 ) -> tuple[PassState, bool]:
-    """`new` with the inertial noise found, and whether that changed little. While some of the model is still missing,
-    residuals hold more than noise: what they give is an upper bound. Beside correlated fixes it is a lower one: the
-    solution follows slow errors of the sensor as it follows those of the fixes, and residuals show the fast part.
+    """`new` with the inertial noise found, and whether that changed little. Beside correlated fixes it is no less than
+    that of the class: the solution follows slow errors of the sensor as it follows those of the fixes, and residuals show the fast part.
     Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
-    scales = noise_scales(builders, windows, estimate, pass_state, level)
+    scales = noise_scales(builders, windows, estimate, pass_state)
     if any(builder.has_correlated_error(pass_state) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
     if pass_state.outlier_tests or one_of(builders, VehicleBuilder) is not None:
-        scales = {name: max(scale, pass_state.scale(name)) for name, scale in scales.items()}
-    if pass_state.stage < LAST_STAGE:
-        scales = {name: min(scale, pass_state.scale(name)) for name, scale in scales.items()}
-        return replace(new, noise_scales={**new.noise_scales, **scales}), True
-    scales |= row_scales(builders, estimate, pass_state)
+        scales = {name: max(scale, min(1.0, pass_state.scale(name))) for name, scale in scales.items()}
+    if pass_state.stage == LAST_STAGE:
+        scales |= row_scales(builders, estimate, pass_state)
     change = [abs(np.log(scale / pass_state.scale(name))) for name, scale in scales.items()]
     return replace(new, noise_scales={**new.noise_scales, **scales}), max(change, default=0.0) < STEADY_INERTIAL
 
