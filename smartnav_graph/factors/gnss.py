@@ -28,6 +28,7 @@ from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.detect.scatter import Scatter, scatter
 from smartnav_graph.session.stream import Positioned
 
 LEAST_CORRELATED_SIGMA = 0.5  # m
@@ -108,7 +109,7 @@ class PositionBuilder(Builder):
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
-    first. Rows are tested with `least_gate_sigma` m at least when outliers are looked for.
+    first. `scatter` of the fixes by themselves, horizontal and vertical. Rows are tested with `least_gate_sigma` m at least when outliers are looked for.
     """
 
     name: str
@@ -121,6 +122,7 @@ class PositionBuilder(Builder):
     gravity: float = STANDARD_GRAVITY
     least_gate_sigma: float = 0.0
     typical: NDArray[np.bool_] | slice = field(default_factory=lambda: slice(None))
+    scatter: tuple[Scatter | None, Scatter | None] = (None, None)
     stage: int = 0
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
@@ -144,7 +146,9 @@ class PositionBuilder(Builder):
         if context.causal:
             first = max(session.t0_ns + round(INITIALISATION_S * NS), int(stream.available_ns.min()))
             typical = stream.available_ns <= first
-        return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical)
+        t_ns, known = stream.t_ns[typical], position[typical]
+        parts = scatter(t_ns, known[:, :2]), scatter(t_ns, known[:, 2:])
+        return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical, scatter=parts)
 
     def has_correlated_error(self, pass_state: PassState) -> bool:
         """Whether these fixes are of a code receiver: by the device's noise, unless they are better than
@@ -152,9 +156,16 @@ class PositionBuilder(Builder):
         typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
         return self.noise.is_correlated and self.config.correlated and typical >= LEAST_CORRELATED_SIGMA
 
+    @property
+    def noise_names(self) -> tuple[str, str]:
+        """Groups of noise: horizontal and vertical."""
+        return self.name, f"{self.name}_vertical"
+
     def scaled_sigma(self, pass_state: PassState) -> Floats:
-        """Sigmas (n, 3) m after the noise scale of this sensor."""
-        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * pass_state.scale(self.name))
+        """Sigmas (n, 3) m after the noise scales of this sensor."""
+        horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
+        scale = np.array([horizontal, horizontal, vertical])
+        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * scale)
 
     def gate(
         self, square: Floats, level: float, rows: NDArray[np.intp], probability: float | None = None
@@ -241,7 +252,7 @@ class PositionBuilder(Builder):
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        sigma = self.sigma[row] * (1.0 if self.own_sigma[row] else pass_state.scale(self.name))
+        sigma = self.scaled_sigma(pass_state)[row]
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:

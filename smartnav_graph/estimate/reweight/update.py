@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
-from smartnav_graph.estimate.reweight.imu_noise import noise_scales
+from smartnav_graph.estimate.reweight.imu_noise import RELAXATION, noise_scales
 from smartnav_graph.estimate.reweight.outliers import (
     FixResiduals,
     Verdict,
@@ -39,11 +39,14 @@ from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.states import kind_of
 from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.graph.windows import Window
+from smartnav_graph.session.detect.scatter import Scatter
 from smartnav_graph.smoothers.estimate import Estimate
 
 # No fix is believed better than this, metres: clocks and lever arms are not.
 LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
+# What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
+PRIOR_FIXES = 30.0
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
@@ -99,7 +102,8 @@ def _update_noise_and_fixes(
         return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
     if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
-    steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in found)
+    names = [name for builder, _ in found.values() for name in builder.noise_names]
+    steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in names)
     new, calm = _inertial(builders, windows, estimate, pass_state, new)
     steady = steady and calm
     if not (steady and new.rejected == pass_state.rejected):
@@ -185,17 +189,40 @@ def _inertial(
 
 
 def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassState) -> PassState:
-    """Variance component of the rows without a sigma of their own; rows outside the gate do not count."""
-    if builder.name in pass_state.correlated:
+    """Variance components, horizontal and vertical, of the rows without a sigma of their own; rows outside the gate do
+    not count."""
+    if builder.name in pass_state.correlated or not builder.config.estimate_sigma:
         return pass_state
     outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
         builder.name, frozenset()
     )
     used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
-    redundancy = float(found.redundancy[used].sum())
-    if not builder.config.estimate_sigma or redundancy < LEAST_REDUNDANCY:
-        return pass_state
-    step = float(np.clip(np.sqrt(found.square[used].sum() / redundancy), 0.2, 5.0))
-    least = LEAST_SIGMA / float(builder.sigma[found.rows[used]].min())
-    scale = max(pass_state.scale(builder.name) * step, least)
-    return replace(pass_state, noise_scales={**pass_state.noise_scales, builder.name: scale})
+    normalised = (found.residual / found.sigma) ** 2
+    scales = dict(pass_state.noise_scales)
+    for name, axes, known in zip(builder.noise_names, (slice(0, 2), slice(2, 3)), builder.scatter, strict=True):
+        redundancy = float(found.redundancy[used, axes].sum())
+        if redundancy < LEAST_REDUNDANCY:
+            continue
+        square, default = float(normalised[used, axes].sum()), float(builder.sigma[found.rows[used], axes].min())
+        sigma = default * pass_state.scale(name)
+        scales[name] = _fix_sigma(sigma, square / redundancy, redundancy, default, known) / default
+    return replace(pass_state, noise_scales=scales)
+
+
+def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, known: Scatter | None) -> float:
+    """Next sigma (m) of fixes by the mean square of their residuals, and by their own scatter.
+
+    A solution that is wrong would make the fixes bad until they agree with it: beyond what the fixes show by themselves
+    their sigma rises reluctantly, and it stays within a factor of two of their scatter, where that is noise. Where it holds
+    motion, it is an upper bound, and so are three times the default of the class.
+    """
+    least, most, likely = LEAST_SIGMA, 3.0 * default, default
+    if known is not None and known.is_noise:
+        least, most, likely = known.sigma / 2.0, 2.0 * known.sigma, known.sigma
+    elif known is not None:
+        most, likely = min(2.0 * known.sigma, most), min(known.sigma, default)
+    step = float(np.sqrt(square))
+    wanted = sigma * float(np.clip(step if step > 1.0 else step**RELAXATION, 0.2, 5.0))
+    if wanted > likely:
+        wanted = float(np.sqrt((redundancy * wanted**2 + PRIOR_FIXES * likely**2) / (redundancy + PRIOR_FIXES)))
+    return float(np.clip(wanted, max(least, LEAST_SIGMA), max(most, LEAST_SIGMA)))

@@ -53,16 +53,17 @@ def normalised_residuals(t_ns: Times, position: Floats, spacing: int = 1) -> Flo
     return out
 
 
-def scatter(t_ns: Times, position: Floats) -> Scatter | None:
+def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatter | None:
     """Scatter of fixes (n, d), m; None where there are too few. Rows with the same stamp or position as the row before
-    are one fix."""
-    finite = np.isfinite(position).all(axis=1)
-    t_ns, position = t_ns[finite], position[finite]
+    are one fix. `unit` (n,) or (n, d) m: the scatter in units of these sigmas."""
+    units = np.broadcast_to(1.0 if unit is None else np.reshape(unit, (len(t_ns), -1)), position.shape)
+    used = np.isfinite(position).all(axis=1) & np.isfinite(units).all(axis=1)
+    t_ns, position, units = t_ns[used], position[used], units[used]
     new = np.concatenate([[True], (np.diff(t_ns) > 0) & np.diff(position, axis=0).any(axis=1)])[: len(t_ns)]
-    t_ns, position = t_ns[new], position[new]
+    t_ns, position, units = t_ns[new], position[new], units[new]
     if len(t_ns) < LEAST_FIXES:
         return None
-    sigma, twice = (_sigma(normalised_residuals(t_ns, position, spacing)) for spacing in (1, 2))
+    sigma, twice = (_sigma(normalised_residuals(t_ns, position, spacing) / units) for spacing in (1, 2))
     return Scatter(sigma, twice < NOISE_GROWTH * sigma, len(t_ns))
 
 
