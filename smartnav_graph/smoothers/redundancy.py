@@ -12,7 +12,7 @@ Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.2 (redund
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gtsam
@@ -20,6 +20,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, indices_of, key, kind_of
+from smartnav_graph.graph.update import FactorId
 from smartnav_graph.smoothers.estimate import Estimate, JointCovariance, joint_covariances
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
@@ -36,8 +37,31 @@ class Redundancy(NamedTuple):
     square: float
 
 
+class FactorFit(NamedTuple):
+    """Of one factor: whitened residual (m,), and fitted (m,), the diagonal of J P J^T."""
+
+    factor: FactorId
+    residual: Floats
+    fitted: Floats
+
+
 def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     """Redundancy by name of the factors' `FactorId`, and of the priors of the session states (`CALIBRATION`).
+
+    Raises
+    ------
+    RuntimeError
+        A keyframe is not determined.
+    """
+    total: dict[str, Floats] = {}
+    for factor, residual, fitted in factor_fits(estimate):
+        sums = np.array([len(residual), fitted.sum(), residual @ residual])
+        total[factor.sensor] = total.get(factor.sensor, 0.0) + sums
+    return {name: Redundancy(int(count), *rest) for name, (count, *rest) in total.items()}
+
+
+def factor_fits(estimate: Estimate) -> Iterator[FactorFit]:
+    """The fit of every factor in use, in no particular order.
 
     Raises
     ------
@@ -47,24 +71,23 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     names, linear = _linearized(estimate)
     session, groups = _states(linear, estimate)
     place = {name: row for row, group in enumerate(groups) for name in group}
-    factors: dict[int, list[tuple[str, Any]]] = {}
+    factors: dict[int, list[tuple[FactorId, Any]]] = {}
     for i, name in enumerate(names):
         factor = linear.at(i)
         if factor is not None and not factor.empty():
             first = min(place.get(state, len(groups)) for state in factor.keys())  # noqa: SIM118
             factors.setdefault(first, []).append((name, factor))
     order = gtsam.Ordering([*itertools.chain(*groups), *session])
-    total = {name: np.zeros(3) for name in names}
     for row, joint in joint_covariances(linear.eliminateSequential(order, gtsam.EliminateQR), groups, session):
-        _add_factors(total, factors.get(row, ()), joint)
-    return {name: Redundancy(int(count), *rest) for name, (count, *rest) in total.items() if count}
+        if row in factors:
+            yield from _fits(factors[row], joint)
 
 
-def _add_factors(total: Mapping[str, Floats], factors: Sequence[tuple[str, Any]], joint: JointCovariance) -> None:
-    """Add residuals, fitted and square of some factors to those of their names (3,); joint : of all their states."""
+def _fits(factors: Sequence[tuple[FactorId, Any]], joint: JointCovariance) -> Iterator[FactorFit]:
+    """The fit of some factors; joint : of all their states."""
     parts = [factor.jacobian() for _, factor in factors]
     ends = list(itertools.accumulate(len(residual) for _, residual in parts))
-    J = np.zeros((ends[-1] if ends else 0, len(joint.covariance)))
+    J = np.zeros((ends[-1], len(joint.covariance)))
     for (_, factor), (part, residual), end in zip(factors, parts, ends, strict=True):
         column = 0
         for state in factor.keys():  # noqa: SIM118
@@ -73,19 +96,22 @@ def _add_factors(total: Mapping[str, Floats], factors: Sequence[tuple[str, Any]]
             column += at.stop - at.start
     fitted = ((J @ joint.covariance) * J).sum(axis=1)
     for (name, _), (_, residual), end in zip(factors, parts, ends, strict=True):
-        total[name] += len(residual), fitted[end - len(residual) : end].sum(), residual @ residual
+        yield FactorFit(name, residual, fitted[end - len(residual) : end])
 
 
-def _linearized(estimate: Estimate) -> tuple[list[str], Any]:
-    """The name of every factor in use, and the linear system (gtsam.GaussianFactorGraph) of them in that order."""
+def _linearized(estimate: Estimate) -> tuple[list[FactorId], Any]:
+    """Every factor in use, and the linear system (gtsam.GaussianFactorGraph) of them in that order."""
     priors = [
         gtsam.PriorFactorVector(state.key, state.prior_mean, gtsam.noiseModel.Diagonal.Sigmas(state.prior_sigma))
         for state in estimate.session.values()
         if not state.held
     ]
     graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, estimate.held)
-    names = [tag.sensor for tag, _ in estimate.factors] + [CALIBRATION] * len(priors)
-    names += [stack.blocks[0].sensor for stack in graph.stacks for _ in range(int(stack.used.sum()))]
+    names = [factor for factor, _ in estimate.factors] + [FactorId(CALIBRATION, 0)] * len(priors)
+    for stack in graph.stacks:
+        sensor, used = stack.blocks[0].sensor, stack.used
+        pairs = zip(stack.t_ns[used].tolist(), stack.rows[used].tolist(), strict=True)
+        names += [FactorId(sensor, t_ns, row) for t_ns, row in pairs]
     return names, graph.linearize(estimate.values)
 
 

@@ -47,7 +47,7 @@ def test_each_is_that_of_a_dense_covariance(estimate):
     fitted, start = {}, 0
     for i, name in enumerate(names):
         rows = len(linear.at(i).jacobian()[0])
-        fitted[name] = fitted.get(name, 0.0) + float((Q[start : start + rows] ** 2).sum())
+        fitted[name.sensor] = fitted.get(name.sensor, 0.0) + float((Q[start : start + rows] ** 2).sum())
         start += rows
     found = redundancies(estimate)
     assert set(found) == set(fitted)

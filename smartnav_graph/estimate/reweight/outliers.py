@@ -24,7 +24,8 @@ class FixResiduals:
     """Residuals of one stream of positions at its keyframes.
 
     rows (m,); keyframe (m,) position in the estimate; residual (m, 3) nav m; sigma (m, 3) m as used;
-    posterior (m, 3) variance of the predicted position, m^2; clock (m, 1) m that a clock not yet looked at may put
+    posterior (m, 3) variance of the predicted position, m^2; fitted (m, 3) share of each component's variance that the
+    solution fits, of all its states, NaN where the row is not used; clock (m, 1) m that a clock not yet looked at may put
     between a good fix and its neighbours
     """
 
@@ -34,6 +35,7 @@ class FixResiduals:
     sigma: Floats
     posterior: Floats
     clock: Floats
+    fitted: Floats | None = None
 
     @property
     def square(self) -> Floats:
@@ -42,7 +44,10 @@ class FixResiduals:
     @property
     def redundancy(self) -> Floats:
         """Share (m, 3) of each component's variance that the solution left."""
-        return np.asarray(np.clip(1.0 - self.posterior / self.sigma**2, 0.0, 1.0))
+        fitted = self.posterior / self.sigma**2
+        if self.fitted is not None:
+            fitted = np.where(np.isfinite(self.fitted), self.fitted, fitted)
+        return np.asarray(np.clip(1.0 - fitted, 0.0, 1.0))
 
 
 def fix_residuals(

@@ -41,6 +41,7 @@ from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.detect.scatter import Scatter
 from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.redundancy import FactorFit, factor_fits
 
 # No fix is believed better than this, metres: clocks and lever arms are not.
 LEAST_SIGMA = 0.03
@@ -87,8 +88,9 @@ def _update_noise_and_fixes(
     found = {b.name: (b, fix_residuals(b, windows, estimate, pass_state)) for b in position_builders(builders)}
     found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
     new = pass_state
+    fits = list(factor_fits(estimate)) if pass_state.correlated else []
     for builder, residuals in found.values():
-        new = _rescaled(builder, residuals, new)
+        new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
     if pass_state.phase is Phase.PLAIN and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested):
         return replace(new, phase=Phase.ROBUST), False
@@ -191,7 +193,7 @@ def _inertial(
 def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassState) -> PassState:
     """Variance components, horizontal and vertical, of the rows without a sigma of their own; rows outside the gate do
     not count."""
-    if builder.name in pass_state.correlated or not builder.config.estimate_sigma:
+    if not builder.config.estimate_sigma:
         return pass_state
     outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
         builder.name, frozenset()
@@ -226,3 +228,11 @@ def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, k
     if wanted > likely:
         wanted = float(np.sqrt((redundancy * wanted**2 + PRIOR_FIXES * likely**2) / (redundancy + PRIOR_FIXES)))
     return float(np.clip(wanted, max(least, LEAST_SIGMA), max(most, LEAST_SIGMA)))
+
+
+def with_fits(residuals: FixResiduals, sensor: str, fits: Iterable[FactorFit]) -> FixResiduals:
+    """The residuals with the share of each that the solution fits."""
+    by_row = {fit.factor.row: fit.fitted for fit in fits if fit.factor.sensor == sensor}
+    missing = np.full(3, np.nan)
+    return replace(residuals, fitted=np.array([by_row.get(int(row), missing) for row in residuals.rows]))
+
