@@ -109,7 +109,8 @@ class PositionBuilder(Builder):
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
-    first. `scatter` of the fixes by themselves, horizontal and vertical. Rows are tested with `least_gate_sigma` m at least when outliers are looked for.
+    first. `scatter` of the fixes by themselves, horizontal and vertical. Rows are tested with `least_gate_sigma` m at
+    least when outliers are looked for.
     """
 
     name: str
@@ -150,11 +151,17 @@ class PositionBuilder(Builder):
         parts = scatter(t_ns, known[:, :2]), scatter(t_ns, known[:, 2:])
         return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical, scatter=parts)
 
-    def has_correlated_error(self, pass_state: PassState) -> bool:
+    def has_correlated_error(self, pass_state: PassState, *, doubtful: bool = False) -> bool:
         """Whether these fixes are of a code receiver: by the device's noise, unless they are better than
-        `LEAST_CORRELATED_SIGMA`. Better ones are of carrier phase, without correlated errors of metres."""
+        `LEAST_CORRELATED_SIGMA`. Better ones are of carrier phase, without correlated errors of metres. A receiver
+        that filters its fixes appears to be better too: without sigmas of their own that counts only where nothing
+        else is `doubtful`."""
+        if not (self.noise.is_correlated and self.config.correlated):
+            return False
         typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
-        return self.noise.is_correlated and self.config.correlated and typical >= LEAST_CORRELATED_SIGMA
+        stated = float(self.own_sigma[self.typical].mean()) > 0.5
+        known = self.name in pass_state.correlated
+        return known or typical >= LEAST_CORRELATED_SIGMA or (doubtful and not stated)
 
     @property
     def noise_names(self) -> tuple[str, str]:

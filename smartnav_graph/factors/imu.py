@@ -28,6 +28,7 @@ from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
+from smartnav_graph.session.detect.scatter import sampling_noise
 
 Pim = gtsam.PreintegratedImuMeasurements
 Bias = gtsam.imuBias.ConstantBias
@@ -112,7 +113,8 @@ class ImuBuilder(Builder):
     """Adds `ImuFactor` and the bias walk, and predicts the state at the window's end.
 
     gravity m/s^2; `bridges` gives the noise of each gap by its start stamp; weight : degrees of freedom that `noise`
-    counts for where the data are asked for it.
+    counts for where the data are asked for it; sampling_noise : densities of accelerometer and gyroscope by their
+    samples alone, see `session.detect.scatter`.
     """
 
     noise: ImuNoise
@@ -123,12 +125,18 @@ class ImuBuilder(Builder):
     name: str = "imu"
     stage: int = 0
     weight: float = CLASS_WEIGHT
+    sampling_noise: tuple[float, float] = (0.0, 0.0)
     cache: Preintegrated = field(default_factory=Preintegrated)
     _gap_errors: gap_error.GapErrors = field(default_factory=gap_error.GapErrors)
 
     def has_second_stage(self, pass_state: PassState) -> bool:
         """See `Builder`: noise and scale factors are estimated."""
         return self.config.estimate_noise or self.config.scale_sigma > 0
+
+    def sampling_scales(self) -> dict[str, float]:
+        """The noise between samples over that of `noise`, of accelerometer and gyroscope."""
+        accel, gyro = self.sampling_noise
+        return {"accel": accel / self.noise.accel_noise_density, "gyro": gyro / self.noise.gyro_noise_density}
 
     def params(self, pass_state: PassState, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -285,4 +293,5 @@ def build(context: FactorContext) -> ImuBuilder:
     known = noise != DEVICE_CLASSES[context.calibration.device_class]
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
     gravity, options = context.session.gravity, context.options(ImuConfig)
-    return ImuBuilder(noise, gravity, context.gaps, context.bridges, options, weight=weight)
+    own = sampling_noise(context.session.require_imu())
+    return ImuBuilder(noise, gravity, context.gaps, context.bridges, options, weight=weight, sampling_noise=own)

@@ -37,8 +37,11 @@ from smartnav_graph.smoothers.whole_graph import StackedFactors
 LEAST_REDUNDANCY = 4.0
 # Most that a sigma moves in one pass.
 MOST = 5.0
-# No device is a factor of more than this from what is known of its class.
-WIDEST = 10.0
+# No device is a factor of more than this from what is known of its class, or of more than the second from the noise
+# between its samples, where that is larger.
+WIDEST, WIDEST_OF_SAMPLES = 10.0, 3.0
+# Factor on either beyond which something else may be what makes the noise appear so.
+WORSE = 2.0
 # A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
 SURPRISE = 1e-4
 # The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.
@@ -64,13 +67,14 @@ class Component(NamedTuple):
         """Whether the data say enough of this group: by their number, or by how far off they are."""
         return self.redundancy >= LEAST_REDUNDANCY or self.square > chi2.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
 
-    def scale(self, before: float, weight: float) -> float:
-        """The next scale of the group's sigma; weight : what the noise known before (scale 1) counts for."""
+    def scale(self, before: float, weight: float, most: float = WIDEST) -> float:
+        """The next scale of the group's sigma, at most `most`; weight : what the noise known before (scale 1) counts
+        for."""
         wanted = np.sqrt((before**2 * self.square + weight) / (self.redundancy + weight))
         if abs(np.log(wanted / before)) < 0.5 / np.sqrt(2.0 * (self.redundancy + weight)):
             return before  # half of what the data leave open
         step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
-        return float(np.clip(before * step, 1.0 / WIDEST, WIDEST))
+        return float(np.clip(before * step, 1.0 / WIDEST, most))
 
 
 class _Factors(NamedTuple):
@@ -182,8 +186,17 @@ def noise_scales(
     builder = next((b for b in builders if isinstance(b, ImuBuilder) and b.config.estimate_noise), None)
     if builder is None or len(windows) < 2:
         return {}
+    known = builder.sampling_scales()
     return {
-        name: part.scale(pass_state.scale(name), builder.weight)
+        name: part.scale(pass_state.scale(name), builder.weight, max(WIDEST, WIDEST_OF_SAMPLES * known.get(name, 0.0)))
         for name, part in components(builder, windows, estimate, pass_state).items()
         if part.is_known
     }
+
+
+def worse_than_class(builder: ImuBuilder, pass_state: PassState) -> bool:
+    """Whether the white inertial noise found is beyond its class and beyond what the samples show by themselves."""
+    return any(
+        pass_state.scale(name) > WORSE * max(1.0, WIDEST_OF_SAMPLES * own)
+        for name, own in builder.sampling_scales().items()
+    )

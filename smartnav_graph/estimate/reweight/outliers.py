@@ -25,8 +25,8 @@ class FixResiduals:
 
     rows (m,); keyframe (m,) position in the estimate; residual (m, 3) nav m; sigma (m, 3) m as used;
     posterior (m, 3) variance of the predicted position, m^2; fitted (m, 3) share of each component's variance that the
-    solution fits, of all its states, NaN where the row is not used; clock (m, 1) m that a clock not yet looked at may put
-    between a good fix and its neighbours
+    solution fits, of all its states, NaN where the row is not used; clock (m, 1) m that a clock not yet looked at may
+    put between a good fix and its neighbours
     """
 
     rows: NDArray[np.intp]

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
-from smartnav_graph.estimate.reweight.imu_noise import RELAXATION, noise_scales
+from smartnav_graph.estimate.reweight.imu_noise import RELAXATION, noise_scales, worse_than_class
 from smartnav_graph.estimate.reweight.outliers import (
     FixResiduals,
     Verdict,
@@ -32,6 +32,7 @@ from smartnav_graph.estimate.reweight.outliers import (
 )
 from smartnav_graph.estimate.reweight.track_outliers import ROUNDS, check_tracks
 from smartnav_graph.factors.gnss import PositionBuilder
+from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.smart import SmartBuilder
 from smartnav_graph.factors.vehicle import VehicleBuilder
 from smartnav_graph.graph import gnc
@@ -157,7 +158,9 @@ def extra_passes(builders: Iterable[Builder]) -> int:
 def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The pass state with what joins once the trajectory is found; session states that are not observable are fixed."""
     positions = position_builders(builders)
-    correlated = frozenset(b.name for b in positions if b.has_correlated_error(pass_state))
+    imu = one_of(builders, ImuBuilder)
+    doubtful = imu is not None and pass_state.stage == LAST_STAGE and worse_than_class(imu, pass_state)
+    correlated = frozenset(b.name for b in positions if b.has_correlated_error(pass_state, doubtful=doubtful))
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
@@ -177,7 +180,8 @@ def _inertial(
     new: PassState,
 ) -> tuple[PassState, bool]:
     """`new` with the inertial noise found, and whether that changed little. Beside correlated fixes it is no less than
-    that of the class: the solution follows slow errors of the sensor as it follows those of the fixes, and residuals show the fast part.
+    that of the class: the solution follows slow errors of the sensor as it follows those of the fixes, and residuals
+    show the fast part.
     Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
     scales = noise_scales(builders, windows, estimate, pass_state)
     if any(builder.has_correlated_error(pass_state) for builder in position_builders(builders)):
@@ -215,8 +219,8 @@ def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, k
     """Next sigma (m) of fixes by the mean square of their residuals, and by their own scatter.
 
     A solution that is wrong would make the fixes bad until they agree with it: beyond what the fixes show by themselves
-    their sigma rises reluctantly, and it stays within a factor of two of their scatter, where that is noise. Where it holds
-    motion, it is an upper bound, and so are three times the default of the class.
+    their sigma rises reluctantly, and it stays within a factor of two of their scatter, where that is noise. Where it
+    holds motion, it is an upper bound, and so are three times the default of the class.
     """
     least, most, likely = LEAST_SIGMA, 3.0 * default, default
     if known is not None and known.is_noise:
@@ -235,4 +239,3 @@ def with_fits(residuals: FixResiduals, sensor: str, fits: Iterable[FactorFit]) -
     by_row = {fit.factor.row: fit.fitted for fit in fits if fit.factor.sensor == sensor}
     missing = np.full(3, np.nan)
     return replace(residuals, fitted=np.array([by_row.get(int(row), missing) for row in residuals.rows]))
-

@@ -1,4 +1,6 @@
-"""Scatter of position fixes by themselves: each against the cubic through its four neighbours.
+"""Noise of a stream by itself, before any model of the motion.
+
+Position fixes: each against the cubic through its four neighbours.
 
 A cubic follows the motion over a few fixes, and every correlated error that is slower than these: what is left is the
 white part of the fixes and the motion that no cubic follows. With weights w_j of the cubic at the fix,
@@ -7,6 +9,8 @@ white part of the fixes and the motion that no cubic follows. With weights w_j o
 
 and the median of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
 leaves the same sigma, motion a larger one.
+
+Inertial samples: their second differences hold the noise and vibration that a recording at this rate cannot follow.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS
+from smartnav_graph.session.streams import Imu
 
 LEAST_FIXES = 12
 # Growth of the scatter at twice the spacing below which it is noise, not motion.
@@ -71,3 +76,14 @@ def _sigma(residual: Floats) -> float:
     square = (residual**2).sum(axis=1)
     dim = residual.shape[1]
     return float(np.sqrt(np.median(square[np.isfinite(square)]) / chi2(dim).median()))
+
+
+def sampling_noise(imu: Imu) -> tuple[float, float]:
+    """Density of the noise between inertial samples, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz), of the worst axis: that of
+    white noise with the median square of their second differences."""
+    if len(imu) < LEAST_FIXES:
+        return 0.0, 0.0
+    step_s = float(np.median(np.diff(imu.t_ns))) / NS
+    square = [np.median(np.diff(x, 2, axis=0) ** 2, axis=0).max() for x in (imu.accel, imu.gyro)]
+    accel, gyro = (float(np.sqrt(x / 6.0 / chi2(1).median() * step_s)) for x in square)
+    return accel, gyro
