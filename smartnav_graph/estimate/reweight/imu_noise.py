@@ -41,7 +41,7 @@ MOST = 5.0
 # between its samples, where that is larger.
 WIDEST, WIDEST_OF_SAMPLES = 10.0, 3.0
 # Factor on either beyond which something else may be what makes the noise appear so.
-WORSE = 2.0
+WORSE = 2.5
 # A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
 SURPRISE = 1e-4
 # The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.

@@ -53,7 +53,7 @@ PRIOR_FIXES = 30.0
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
 # have few degrees of freedom and change slowly.
-STEADY = 0.1
+STEADY = 0.05
 STEADY_INERTIAL = float(np.log(1.5))
 
 
@@ -89,7 +89,8 @@ def _update_noise_and_fixes(
     found = {b.name: (b, fix_residuals(b, windows, estimate, pass_state)) for b in position_builders(builders)}
     found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
     new = pass_state
-    fits = list(factor_fits(estimate)) if pass_state.correlated else []
+    exact = pass_state.stage == LAST_STAGE and pass_state.phase in (Phase.PLAIN, Phase.GATED)
+    fits = list(factor_fits(estimate)) if exact else []
     for builder, residuals in found.values():
         new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
