@@ -18,6 +18,7 @@ from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
+from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
 from smartnav_graph.session.holdout import split
@@ -53,6 +54,9 @@ class Notes:
         for name, count in counts.items():
             self.dropped.setdefault(name, {})[reason] = count
 
+
+# Scatter of positions, in units of their sigmas, beyond which these are not believed.
+CLAIM = 2.0
 
 PreparationStep = Callable[[Session, Notes], Session]
 
@@ -136,6 +140,30 @@ def choose_sensors(session: Session, notes: Notes) -> Session:
     unwanted = {name[1:] for name in chosen if name.startswith("-")}
     keep = (wanted or set(there)) - unwanted | {"imu", "reference", "images"}
     return session.replace(**{name: None for name in there if name not in keep})
+
+
+def check_sigmas(session: Session, notes: Notes) -> Session:
+    """Sigmas of positions that their own scatter exceeds by far are raised to it, horizontal and vertical apart. In a
+    replay by what is known at first."""
+    changes: dict[str, Stream | None] = {}
+    for name, stream in session.positions().items():
+        if stream.sigma is None:
+            continue
+        position, sigma, factors = session.nav_position(stream), stream.sigma.copy(), {}
+        late = notes.causal & (stream.available_ns > notes.span[0] + round(INITIALISATION_S * NS))
+        for part, axes in {"horizontal": slice(0, 2), "vertical": slice(2, 3)}.items():
+            found = scatter(stream.t_ns[~late], position[~late, axes], stream.sigma[~late, axes])
+            if found is not None and found.is_noise and found.sigma > CLAIM:
+                sigma[:, axes] *= found.sigma
+                factors[part] = found.sigma
+        if factors:
+            changes[name] = replace(stream, sigma=sigma)
+            text = " and ".join(f"{part} {factor:.2g}" for part, factor in factors.items())
+            notes.warnings.append(
+                f"{name}: positions scatter by more than their sigmas say, by a factor of {text}; the sigmas are "
+                "multiplied by it; correct the sigma columns"
+            )
+    return session.replace(**changes) if changes else session
 
 
 def undo_latencies(session: Session, notes: Notes) -> Session:
@@ -242,6 +270,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "sensors": choose_sensors,
     "latency": undo_latencies,
     "holdout": withhold,
+    "sigmas": check_sigmas,
     "outside": drop_outside,
     "lead": trim_span,
     "images": pair_images,

@@ -119,7 +119,7 @@ def test_progress_is_told(eight):
     seen = []
     smooth(eight, progress=lambda *row: seen.append(row))
     assert seen[:2] == [("preparing", 0, 0), ("finding the start", 0, 0)]
-    assert seen[2:4] == [("pass 1 of at most 8", 0, 62), ("pass 1 of at most 8", 1, 62)]
+    assert seen[2:4] == [("pass 1 of at most 14", 0, 62), ("pass 1 of at most 14", 1, 62)]
     assert seen[-1][0].endswith("solving")
     seen.clear()
     replay(eight, progress=lambda *row: seen.append(row))

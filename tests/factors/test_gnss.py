@@ -89,8 +89,8 @@ def test_sigmas_are_the_rows_own_where_known_and_the_default_elsewhere():
 
 
 def test_a_noise_scale_leaves_sigmas_that_came_with_the_data_alone():
-    pass_state = PassState(noise_scales={"gnss": 5.0})
-    for own, expected in ((True, [1, 2, 3]), (False, [5, 10, 15])):
+    pass_state = PassState(noise_scales={"gnss": 5.0, "gnss_vertical": 4.0})
+    for own, expected in ((True, [1, 2, 3]), (False, [5, 10, 12])):
         ((_, factor),) = added(builder(own=own), pass_state).factors
         np.testing.assert_allclose(factor.noiseModel().sigmas(), expected)
         np.testing.assert_allclose(builder(own=own).scaled_sigma(pass_state), [expected])

@@ -42,6 +42,8 @@ MOST = 5.0
 WIDEST, WIDEST_OF_SAMPLES = 10.0, 3.0
 # Factor on either beyond which something else may be what makes the noise appear so.
 WORSE = 2.5
+# Normalised square at which fixes contradict their sigma.
+CONTRADICTION = 2.0
 # A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
 SURPRISE = 1e-4
 # The iteration creeps where the solution follows the noise: steps of the sigma's logarithm are so much longer.
@@ -67,12 +69,18 @@ class Component(NamedTuple):
         """Whether the data say enough of this group: by their number, or by how far off they are."""
         return self.redundancy >= LEAST_REDUNDANCY or self.square > chi2.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
 
-    def scale(self, before: float, weight: float, most: float = WIDEST) -> float:
-        """The next scale of the group's sigma, at most `most`; weight : what the noise known before (scale 1) counts
-        for."""
-        wanted = np.sqrt((before**2 * self.square + weight) / (self.redundancy + weight))
-        if abs(np.log(wanted / before)) < 0.5 / np.sqrt(2.0 * (self.redundancy + weight)):
-            return before  # half of what the data leave open
+    def scale(self, before: float, weight: float, most: float = WIDEST, level: float = 1.0) -> float:
+        """The next scale of the group's sigma, at most `most`.
+
+        weight : what the noise known before (scale 1) counts for; level : normalised square of the fixes with sigmas of
+        their own. Where they contradict these more than the group does, they bend the solution, and the noise is not to
+        blame.
+        """
+        blamed = level < CONTRADICTION or self.square > level * self.redundancy
+        square = self.square if blamed else min(self.square, self.redundancy)
+        wanted = np.sqrt((before**2 * square + weight) / (self.redundancy + weight))
+        if abs(np.log(wanted / before)) < 0.2 / np.sqrt(2.0 * (self.redundancy + weight)):
+            return before  # a fifth of what the data leave open
         step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
         return float(np.clip(before * step, 1.0 / WIDEST, most))
 
@@ -181,14 +189,17 @@ def noise_scales(
     windows: Sequence[Window],
     estimate: Estimate,
     pass_state: PassState,
+    level: float = 1.0,
 ) -> dict[str, float]:
-    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of."""
+    """Scales of the inertial noise as the kept data show them, of the groups that they say enough of; `level` is the
+    normalised square of the fixes with sigmas of their own."""
     builder = next((b for b in builders if isinstance(b, ImuBuilder) and b.config.estimate_noise), None)
     if builder is None or len(windows) < 2:
         return {}
     known = builder.sampling_scales()
+    most = {name: max(WIDEST, WIDEST_OF_SAMPLES * known.get(name, 0.0)) for name in NOISE_NAMES}
     return {
-        name: part.scale(pass_state.scale(name), builder.weight, max(WIDEST, WIDEST_OF_SAMPLES * known.get(name, 0.0)))
+        name: part.scale(pass_state.scale(name), builder.weight, most[name], level)
         for name, part in components(builder, windows, estimate, pass_state).items()
         if part.is_known
     }

@@ -53,8 +53,8 @@ PRIOR_FIXES = 30.0
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
 # have few degrees of freedom and change slowly.
-STEADY = 0.05
-STEADY_INERTIAL = float(np.log(1.5))
+STEADY = 0.1
+STEADY_INERTIAL = 0.1
 
 
 # Growth of mu a pass, and the most passes that takes.
@@ -108,7 +108,7 @@ def _update_noise_and_fixes(
         new = replace(new, rejected=outliers)
     names = [name for builder, _ in found.values() for name in builder.noise_names]
     steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in names)
-    new, calm = _inertial(builders, windows, estimate, pass_state, new)
+    new, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
     steady = steady and calm
     if not (steady and new.rejected == pass_state.rejected):
         return new, False
@@ -173,18 +173,29 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=correlated)
 
 
+def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
+    """Normalised square of the fixes in use with sigmas of their own over their redundancy, at least 1."""
+    square = redundancy = 0.0
+    for name, (builder, one) in found.items():
+        used = pass_state.used(name, one.rows) & builder.own_sigma[one.rows]
+        square += float(one.square[used].sum())
+        redundancy += float(one.redundancy[used].sum())
+    return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
+
+
 def _inertial(
     builders: Sequence[Builder],
     windows: Sequence[Window],
     estimate: Estimate,
     pass_state: PassState,
     new: PassState,
+    level: float,
 ) -> tuple[PassState, bool]:
     """`new` with the inertial noise found, and whether that changed little. Beside correlated fixes it is no less than
     that of the class: the solution follows slow errors of the sensor as it follows those of the fixes, and residuals
     show the fast part.
     Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
-    scales = noise_scales(builders, windows, estimate, pass_state)
+    scales = noise_scales(builders, windows, estimate, pass_state, level)
     if any(builder.has_correlated_error(pass_state) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
     if pass_state.outlier_tests or one_of(builders, VehicleBuilder) is not None:

@@ -8,7 +8,8 @@ white part of the fixes and the motion that no cubic follows. With weights w_j o
     r = p - sum_j w_j p_j        var r = sigma^2 (1 + sum_j w_j^2)
 
 and the median of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
-leaves the same sigma, motion a larger one.
+leaves the same sigma, motion a larger one; and neighbouring r of white noise are of opposite sign (their correlation is
+-0.8), those of a motion are not. Fixes too far apart follow no motion, and their scatter is an upper bound.
 
 Inertial samples: their second differences hold the noise and vibration that a recording at this rate cannot follow.
 """
@@ -25,8 +26,9 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
 
 LEAST_FIXES = 12
-# Growth of the scatter at twice the spacing below which it is noise, not motion.
-NOISE_GROWTH = 1.5
+# Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
+# and longest median spacing.
+NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,10 @@ def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatte
     t_ns, position, units = t_ns[new], position[new], units[new]
     if len(t_ns) < LEAST_FIXES:
         return None
-    sigma, twice = (_sigma(normalised_residuals(t_ns, position, spacing) / units) for spacing in (1, 2))
-    return Scatter(sigma, twice < NOISE_GROWTH * sigma, len(t_ns))
+    near, far = (normalised_residuals(t_ns, position, spacing) / units for spacing in (1, 2))
+    sigma, sign = _sigma(near), float(np.nanmean(np.sign(near[1:] * near[:-1])))
+    close = float(np.median(np.diff(t_ns))) / NS < NOISE_SPACING_S
+    return Scatter(sigma, close and sign < NOISE_SIGN and _sigma(far) < NOISE_GROWTH * sigma, len(t_ns))
 
 
 def _sigma(residual: Floats) -> float:

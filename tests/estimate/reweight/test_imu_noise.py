@@ -15,7 +15,15 @@ import smartnav_graph as sn
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
-from smartnav_graph.estimate.reweight.imu_noise import MOST, NOISE_NAMES, WIDEST, Component, components
+from smartnav_graph.estimate.reweight.imu_noise import (
+    LEAST_REDUNDANCY,
+    MOST,
+    NOISE_NAMES,
+    WIDEST,
+    Component,
+    components,
+    worse_than_class,
+)
 from smartnav_graph.evaluation.metrics import nees
 from smartnav_graph.factors.imu import CALIBRATED_WEIGHT, CLASS_WEIGHT, ImuBuilder, ImuConfig
 from smartnav_graph.factors.prior import PriorBuilder
@@ -99,12 +107,27 @@ def test_one_pass_moves_a_sigma_by_a_bounded_step_and_no_device_is_off_without_l
     assert Component(0.0, 1e9).scale(0.11, CLASS_WEIGHT) == 1.0 / WIDEST
 
 
-def test_fixes_that_contradict_their_sigma_take_the_blame():
+def test_fixes_that_contradict_their_own_sigma_take_the_blame():
     bent = Component(400.0, 100.0)
     assert bent.scale(1.0, CLASS_WEIGHT, level=9.0) == pytest.approx(1.0)
     assert bent.scale(1.0, CLASS_WEIGHT, level=1.9) == bent.scale(1.0, CLASS_WEIGHT) > 1.5
     quiet = Component(25.0, 100.0)
     assert quiet.scale(1.0, CLASS_WEIGHT, level=9.0) == quiet.scale(1.0, CLASS_WEIGHT) < 0.7
+
+
+def test_few_residuals_count_where_they_are_far_off():
+    assert (
+        not Component(3.0, 1.6).is_known
+        and Component(670.0, 1.6).is_known
+        and Component(4.0, LEAST_REDUNDANCY).is_known
+    )
+
+
+def test_noise_is_worse_than_its_class_only_beyond_what_the_samples_show():
+    quiet, shaken = (ImuBuilder(KNOWN, 9.81, sampling_noise=(k * KNOWN.accel_noise_density, 0.0)) for k in (0.1, 2.0))
+    found = PassState(noise_scales={"accel": 4.0})
+    assert worse_than_class(quiet, found) and not worse_than_class(shaken, found)
+    assert not worse_than_class(quiet, PassState(noise_scales={"accel": 1.5, "gyro_walk": 9.0}))
 
 
 # --- the statistics ---------------------------------------------------------------------------------------------------

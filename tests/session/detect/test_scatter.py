@@ -39,6 +39,16 @@ def test_motion_is_no_noise() -> None:
     assert found is not None and not found.is_noise and found.sigma > 0.02
 
 
+def test_motion_too_fast_for_the_fixes_is_no_noise() -> None:
+    """At every spacing a cubic leaves the whole of it."""
+    t = np.arange(300.0)
+    swing = np.stack([20 * np.sin(1.2 * t), 20 * np.cos(1.2 * t)], axis=1)
+    turns = np.random.default_rng(5).normal(0.0, 30.0, (300, 2))
+    for position, step_s in ((swing, 1.0), (turns, 10.0)):
+        found = scatter(stamps(300, step_s), position)
+        assert found is not None and not found.is_noise
+
+
 def test_slow_errors_do_not_show() -> None:
     rng = np.random.default_rng(3)
     slow = np.zeros((600, 2))
