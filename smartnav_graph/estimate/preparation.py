@@ -55,8 +55,8 @@ class Notes:
             self.dropped.setdefault(name, {})[reason] = count
 
 
-# Scatter of positions, in units of their sigmas, beyond which these are not believed.
-CLAIM = 2.0
+# Scatter of positions, in units of their sigmas, beyond which these are not believed; smaller scatter may be a motion.
+CLAIM, LEAST_SCATTER_M = 2.0, 0.5
 
 PreparationStep = Callable[[Session, Notes], Session]
 
@@ -143,24 +143,21 @@ def choose_sensors(session: Session, notes: Notes) -> Session:
 
 
 def check_sigmas(session: Session, notes: Notes) -> Session:
-    """Sigmas of positions that their own scatter exceeds by far are raised to it, horizontal and vertical apart. In a
-    replay by what is known at first."""
+    """Sigmas of positions that their own scatter exceeds by far are multiplied by that factor. In a replay by what is
+    known at first. On a swinging foot scatter says nothing: no fix follows its motion."""
     changes: dict[str, Stream | None] = {}
     for name, stream in session.positions().items():
-        if stream.sigma is None:
+        if stream.sigma is None or session.device.mounting == "foot":
             continue
-        position, sigma, factors = session.nav_position(stream), stream.sigma.copy(), {}
         late = notes.causal & (stream.available_ns > notes.span[0] + round(INITIALISATION_S * NS))
-        for part, axes in {"horizontal": slice(0, 2), "vertical": slice(2, 3)}.items():
-            found = scatter(stream.t_ns[~late], position[~late, axes], stream.sigma[~late, axes])
-            if found is not None and found.is_noise and found.sigma > CLAIM:
-                sigma[:, axes] *= found.sigma
-                factors[part] = found.sigma
-        if factors:
-            changes[name] = replace(stream, sigma=sigma)
-            text = " and ".join(f"{part} {factor:.2g}" for part, factor in factors.items())
+        t_ns, position = stream.t_ns[~late], session.nav_position(stream)[~late, :2]
+        found, relative = scatter(t_ns, position), scatter(t_ns, position, stream.sigma[~late, :2])
+        if found is None or relative is None or not found.is_noise:
+            continue
+        if found.sigma > LEAST_SCATTER_M and relative.sigma > CLAIM:
+            changes[name] = replace(stream, sigma=stream.sigma * relative.sigma)
             notes.warnings.append(
-                f"{name}: positions scatter by more than their sigmas say, by a factor of {text}; the sigmas are "
+                f"{name}: positions scatter by {found.sigma:.2g} m, {relative.sigma:.2g} times their sigmas, which are "
                 "multiplied by it; correct the sigma columns"
             )
     return session.replace(**changes) if changes else session

@@ -192,7 +192,7 @@ def test_scale_and_misalignment_are_found_within_their_sigma(recovered):
         value, sigma = np.array(state["value"]), np.array(state["sigma"])
         assert not state["held"] and summary["converged"]
         assert (np.abs(value - S) < 3.5 * sigma).all()
-        assert (sigma < 0.5 * SIGMA).sum() >= 4
+        assert (sigma < 0.6 * SIGMA).sum() >= 4
         assert sigma[[0, 17]].max() < 0.25 * SIGMA  # the scale along the way, and that of the turns
 
 

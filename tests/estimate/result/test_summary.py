@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sessions import on_control, recorded, with_gnss
 
 import smartnav_graph as sn
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result.summary import peak_memory_mb, versions
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.factors.imu import ImuConfig
 
 KEYS = {
     *("mode", "duration_s", "path_m", "keyframes", "factors", "chi2_per_dof", "iterations", "converged", "states"),
@@ -59,11 +63,20 @@ def test_chi_square_follows_the_sigmas(eight):
     assert told[0] > 2.5 * told[1] and told[2] < told[1] / 2.5
 
 
-def test_a_misfit_is_told(eight, summary):
+def test_a_misfit_is_a_warning(eight, summary):
     assert not any(text.startswith("solve:") for text in summary["warnings"])
-    bold = sn.run(with_gnss(eight, sigma=eight.gnss.sigma / 4)).summary
-    assert bold["chi2_per_dof"]["overall"] > 4.0
-    assert any("measurements contradict each other or their sigmas are too small" in text for text in bold["warnings"])
+    half = np.arange(len(eight.gnss)) > len(eight.gnss) // 2
+    torn = eight.gnss.enu + np.where(half, 60.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    rigid = Config(imu=ImuConfig(estimate_noise=False), gnss=GnssConfig(loss="none"))
+    found = sn.run(eight.replace(gnss=replace(eight.gnss, enu=torn)), rigid).summary
+    assert found["chi2_per_dof"]["overall"] > 4.0
+    assert any("measurements contradict each other or their sigmas are too small" in text for text in found["warnings"])
+
+
+def test_sigmas_four_times_too_small_are_a_warning(eight):
+    found = sn.run(with_gnss(eight, sigma=eight.gnss.sigma / 4)).summary
+    assert any("scatter" in text for text in found["warnings"])
+    assert 0.6 < found["chi2_per_dof"]["gnss"] < 1.4
 
 
 def test_a_sigma_found_on_the_way_is_a_state(eight, summary):
