@@ -90,7 +90,7 @@ class SessionCommand(Command):
     rate: Annotated[Text, tyro.conf.arg(metavar="keyframes|imu|HZ")] = None
     """Output rate of the trajectory."""
     repair: Repairs = None
-    """Repairs of faulty rows: nan, order, stamps."""
+    """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
     options: Annotated[tyro.conf.FlagConversionOff[Config], tyro.conf.arg(name="")] = field(default_factory=Config)
 
     @classmethod

@@ -43,7 +43,7 @@ class Import(Writing):
     format: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
     """The format, if it is not recognised (see `smartnav formats`)."""
     repair: Repairs = None
-    """Repairs of faulty rows: nan, order, stamps."""
+    """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
 
     def run(self) -> None:
         from smartnav_graph import readers
@@ -67,7 +67,7 @@ class Info(Command):
     session: SourceName
     """Session folder, or a log of a known format."""
     repair: Repairs = None
-    """Repairs of faulty rows: nan, order, stamps."""
+    """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
 
     def run(self) -> None:
         from smartnav_graph import readers

@@ -21,6 +21,8 @@ from smartnav_graph.session.detect.moving import Moving, find_moving, without_mo
 from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
+from smartnav_graph.session.health.inertial import spikes
+from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
@@ -77,6 +79,15 @@ def choose_span(session: Session, notes: Notes) -> Session:
     return session
 
 
+def drop_spikes(session: Session, notes: Notes) -> Session:
+    """Inertial data without single readings far from their neighbours; the health names them."""
+    imu = session.require_imu()
+    found = spikes(imu)
+    rows = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *found.values()]))
+    notes.drop("far from their neighbours", {"imu": len(rows)} if len(rows) else {})
+    return session.replace(imu=imu.take(np.setdiff1d(np.arange(len(imu)), rows))) if len(rows) else session
+
+
 def find_imu_gaps(session: Session, notes: Notes) -> Session:
     """Gaps of the inertial data inside the span."""
     imu, rule = session.require_imu(), notes.config.gaps
@@ -113,6 +124,8 @@ def check_health(session: Session, notes: Notes) -> Session:
     checked = health.inspect(session, notes.gaps, notes.clocks)
     checked.raise_errors()
     notes.warnings += checked.warnings()
+    session, wrong = without_wrong_units(session, checked.findings)
+    notes.warnings += [f"{name}: not used, because it is in another unit" for name in wrong]
     return session
 
 
@@ -263,6 +276,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "gaps": find_imu_gaps,
     "clocks": align_clocks,
     "health": check_health,
+    "spikes": drop_spikes,
     "calibration": calibrate,
     "sensors": choose_sensors,
     "latency": undo_latencies,

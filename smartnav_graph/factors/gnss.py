@@ -35,6 +35,7 @@ LEAST_CORRELATED_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
+UNKNOWN_HEIGHT_SIGMA = 1e4  # m, of a horizontal fix
 LEAST_WEIGHT = 1e-4  # below it a row is left out
 
 
@@ -89,12 +90,14 @@ def clock_state(sensor: str, sigma: float, initial: float = 0.0) -> SessionState
 
 
 def fix_sigmas(stream: Positioned, default: GnssNoise) -> Floats:
-    """Sigmas (n, 3) m: the stream's own where given, the class default elsewhere."""
+    """Sigmas (n, 3) m: the stream's own where given, the class default elsewhere; `UNKNOWN_HEIGHT_SIGMA` where the row
+    has no height."""
     h, v = default.horizontal_sigma, default.vertical_sigma
     sigma = np.tile(np.array([h, h, v]), (len(stream), 1))
     if stream.sigma is not None:
         known = np.isfinite(stream.sigma)
         sigma[known] = stream.sigma[known]
+    sigma[~stream.has_height, 2] = UNKNOWN_HEIGHT_SIGMA
     return sigma
 
 

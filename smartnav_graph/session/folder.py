@@ -17,6 +17,7 @@ from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.session import repair
 from smartnav_graph.session.calibration.model import calibration_toml, load_calibration
+from smartnav_graph.session.health.units import in_right_units
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
@@ -141,6 +142,7 @@ def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
             dropped |= {name: counts} if counts else {}
     header["repairs"] = wanted
     try:
-        return Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **{**header, **streams})
+        session = Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **{**header, **streams})
     except SessionError as error:
         raise error.located(folder / f"{error.stream}.parquet" if error.stream else folder) from error
+    return in_right_units(session) if "units" in wanted else session

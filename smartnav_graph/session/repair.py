@@ -5,6 +5,7 @@
            inertial rows that arrive in bursts spread evenly
 ``order``  rows sorted by stamp (stable), rows with a repeated stamp dropped; refused where a clock was set back
 ``nan``    rows with a non-finite required value dropped
+``units``  readings that are known to be in another unit converted (of the whole session, see `health.units`)
 ``stamps`` jittered inertial stamps rebuilt between gaps: row order is kept, each becomes its 4 s moving mean
 =========  ==========================================================================================
 """
@@ -19,10 +20,11 @@ from scipy.ndimage import uniform_filter1d
 from smartnav_graph.core.arrays import Column, Indices, Mask, Table, Times
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session.stream import Stream
+from smartnav_graph.session.stream import Stream, required_columns
 from smartnav_graph.session.streams import Imu
 
-REPAIRS = ("nan", "clock", "stamps", "order")
+_OF_ROWS = ("nan", "clock", "stamps", "order")
+REPAIRS = (*_OF_ROWS, "units")
 _RESET_S, _RESET_ROWS = 1.0, 10  # a clock set back by less, or of fewer rows, is disorder
 _WEEK_S = 604_800
 _BURST = 0.05  # of the mean step: steps within a burst
@@ -54,7 +56,7 @@ def repair(kind: type[Stream], table: Mapping[str, Column], names: Iterable[str]
     rows: Table = dict(table)
     counts: dict[str, int] = {}
     for name in check_names(names):
-        if "t_ns" in rows and len(rows["t_ns"]):
+        if name in _OF_ROWS and "t_ns" in rows and len(rows["t_ns"]):
             rows, found = _STEPS[name](kind, rows)
             counts |= {reason: counts.get(reason, 0) + count for reason, count in found.items() if count}
     return rows, counts
@@ -68,9 +70,8 @@ def _drop_nan(kind: type[Stream], rows: Table) -> tuple[Table, dict[str, int]]:
     required = [
         name
         for spec in kind.specs()
-        if spec.metadata["kind"] == "float" and not spec.metadata["nan"]
-        for name in spec.metadata["columns"]
-        if name in rows
+        for name, required in zip(spec.metadata["columns"], required_columns(spec), strict=True)
+        if required and name in rows
     ]
     good = np.ones(len(rows["t_ns"]), dtype=bool)
     for name in required:

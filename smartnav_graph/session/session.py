@@ -126,11 +126,19 @@ class Session(Streams):
         return None if self.origin is None else LocalFrame(self.origin)
 
     def nav_position(self, stream: Located) -> Floats:
-        """Positions (n, 3) of a stream in nav metres."""
+        """Positions (n, 3) of a stream in nav metres. Unknown heights are the median of the known ones, or that of the
+        origin; see `Located.has_height`."""
+        rows = stream.enu if stream.enu is not None else stream.lla
+        assert rows is not None  # checked when the stream was built
+        known = stream.has_height
+        if not known.all():
+            zero = 0.0 if stream.lla is None or self.origin is None else self.origin.height_m
+            height = np.where(known, rows[:, 2], np.median(rows[known, 2]) if known.any() else zero)
+            rows = np.column_stack([rows[:, :2], height])
         if stream.enu is not None:
-            return stream.enu
-        assert self.frame is not None and stream.lla is not None  # checked when the session was built
-        return self.frame.nav_from_lla(stream.lla)
+            return rows
+        assert self.frame is not None  # checked when the session was built
+        return self.frame.nav_from_lla(rows)
 
     @property
     def gravity(self) -> float:

@@ -20,8 +20,8 @@ from smartnav_graph.core.timebase import NS
 _DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
 
 
-def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool = False) -> Any:
-    """A field stored as the file columns `names`; `nan` allows unknown rows."""
+def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool | str = False) -> Any:
+    """A field stored as the file columns `names`; `nan` allows unknown values, or names the column that may."""
     meta = {"columns": names, "kind": kind, "nan": nan}
     return field(metadata=meta) if not optional else field(default=None, metadata=meta)
 
@@ -29,6 +29,12 @@ def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool
 def axes(template: str, names: str = "xyz", *, optional: bool = False, nan: bool = False) -> Any:
     """A vector stored as one file column per axis: ``{}`` in `template` becomes its name."""
     return quantity(*(template.format(name) for name in names), optional=optional, nan=nan)
+
+
+def required_columns(spec: Field[object]) -> list[bool]:
+    """Which columns of a field must be finite."""
+    names, nan = spec.metadata["columns"], spec.metadata["nan"]
+    return [spec.metadata["kind"] == "float" and not (name == nan if isinstance(nan, str) else nan) for name in names]
 
 
 class Label(NamedTuple):
@@ -85,7 +91,8 @@ class Stream:
         if array.shape != shape:
             raise self._error(f"{spec.name} has shape {array.shape}", f"{shape}, one row per time stamp")
         if kind == "float":
-            bad = np.isinf(array) if spec.metadata["nan"] else ~np.isfinite(array)
+            required = np.array(required_columns(spec))
+            bad = np.isinf(array) | np.isnan(array) & (required if len(names) > 1 else required[0])
             if bad.any():
                 where = np.argwhere(bad)[0]
                 name = names[int(where[1]) if len(where) > 1 else 0]
@@ -111,6 +118,8 @@ class Stream:
             remedy = "correct the file, or add --repair order to sort rows and drop repeated stamps, counted"
             if step.min() < -NS:
                 remedy += "; --repair clock where the clock was set back"
+            if (step == 0).sum() > len(step) / 2:  # rounded to a unit longer than the period
+                found, remedy = f"{found}: stamps look like whole seconds", "give t_ns in nanoseconds, with every digit"
             raise self._error(found, rule, remedy, row)
         early = np.zeros(0) if self.arrival_ns is None else np.flatnonzero(self.arrival_ns < self.t_ns)
         if len(early):
@@ -184,9 +193,32 @@ class Located(Stream):
     lla: Floats | None = quantity(*LLA, optional=True)
     enu: Floats | None = quantity(*ENU, optional=True)
 
+    def _check_rows(self) -> None:
+        super()._check_rows()
+        if self.lla is None:
+            return
+        for name, limit, degrees in (("lat_deg", 90.0, self.lla[:, 0]), ("lon_deg", 360.0, self.lla[:, 1])):
+            outside = np.flatnonzero(np.abs(degrees) > limit)
+            if len(outside):
+                row, value = int(outside[0]), float(degrees[outside[0]])
+                looks = "degrees x 1e7" if abs(value) > 1e6 else "ddmm.mmmm of NMEA" if abs(value) < 36_000.0 else ""
+                found = f"{name} is {value:.10g} at row {row} ({len(outside)} such rows in all)"
+                found += f": it looks like {looks}" if looks else ""
+                raise self._error(found, f"-{limit:g} to {limit:g} degrees", "give decimal degrees", row)
+
+    @property
+    def has_height(self) -> Mask:
+        """Mask (n,) of the rows whose height is known."""
+        rows = self.enu if self.enu is not None else self.lla
+        assert rows is not None  # checked when the stream was built
+        return np.isfinite(rows[:, 2])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Positioned(Located):
-    """Rows with a position of a sensor of the device, and its 1-sigma (n, 3) m."""
+    """Rows with a position of a sensor of the device, and its 1-sigma (n, 3) m. The height may be unknown (NaN): the
+    row is a horizontal fix."""
 
+    lla: Floats | None = quantity(*LLA, optional=True, nan="height_m")
+    enu: Floats | None = quantity(*ENU, optional=True, nan="u_m")
     sigma: Floats | None = axes("sigma_{}_m", "enu", optional=True, nan=True)

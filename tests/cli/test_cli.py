@@ -107,7 +107,7 @@ def test_evaluate_prints_only_the_json_of_the_contract(call):
     told = json.loads(out)
     assert list(told) == [
         *("solution", "reference", "align", "time_offset_s", "matched", "unmatched"),
-        *("ape_m", "rotation_deg", "rpe", "nees"),
+        *("ape_m", "rotation_deg", "rpe", "nees", "nees_verdict"),
     ]
     assert list(told["ape_m"]) == list(told["rotation_deg"]) == ["rmse", "mean", "p50", "p67", "p95", "max"]
     assert list(told["rpe"][0]) == ["delta_s", "translation_m", "rotation_deg"]

@@ -261,6 +261,33 @@ def test_stamps_of_arrival_in_bursts_are_an_error():
         inspect(make_session(imu=replace(imu, t_ns=t_ns))).raise_errors()
 
 
+def test_a_slow_imu_is_reported():
+    assert "10 Hz is too low to follow the motion" in only(
+        inspect(make_session(imu=make_imu().take(slice(None, None, 10)))), "warning"
+    )
+
+
+@pytest.mark.parametrize(("name", "size"), [("accel", 1000.0), ("gyro", -500.0)])
+def test_a_single_reading_far_from_its_neighbours_is_found_by_row_and_time(name, size):
+    imu = make_imu()
+    values = getattr(imu, name).copy()
+    values[512, 1] = size
+    found = only(inspect(make_session(imu=replace(imu, **{name: values}))), "warning")
+    assert f"1 single reading of {name}" in found and "at row 512, 5.120 s" in found
+
+
+def test_scatter_of_fixes_against_their_sigma():
+    rng = np.random.default_rng(0)
+    fixes = make_fixes(0.0, 60.0)
+    enu = 3.0 * rng.normal(size=(len(fixes), 3))
+    for sigma, count in ((0.001, 2), (2.0, 0), (5.0, 0)):
+        stream = GnssFix(t_ns=fixes.t_ns, enu=enu, sigma=np.full(enu.shape, sigma))
+        warnings = [
+            text for text in inspect(make_session(imu=make_imu(70.0), gnss=stream)).warnings() if "scatter" in text
+        ]
+        assert len(warnings) == count, warnings
+
+
 def test_unix_clock_in_milliseconds():
     imu, fixes = make_imu(), make_fixes()
     shift = T0 - T0 // 1_000_000

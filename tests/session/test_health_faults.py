@@ -19,7 +19,7 @@ sound = cache(simulate)
 
 
 def warnings_of(session: Session) -> list[str]:
-    return inspect(session).warnings()
+    return [str(finding) for finding in inspect(session).findings if finding.level != "info"]
 
 
 def changed(session: Session, stream: str, **values) -> Session:

@@ -11,7 +11,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Mask, Times, runs
 from smartnav_graph.core.timebase import NS, Gap, interpolate
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.stream import Positioned
+from smartnav_graph.session.stream import Positioned, Stream
 from smartnav_graph.session.streams import STREAMS, Imu
 
 AIDING = tuple(name for name, kind in STREAMS.items() if kind.AIDING)
@@ -19,6 +19,7 @@ LEAST_ROWS = 10  # shorter streams are not checked
 CHORD_S = 4.0  # s between the fixes of a speed
 _SPEEDS = {3.6: "km/h", 1.944: "knots", 2.237: "mph", 3.281: "ft/s", 100.0: "cm/s", 1000.0: "mm/s"}
 _NEAR = 0.06  # of a unit's factor
+_TOGETHER = 50  # rows that may arrive together
 _ODD = 1.3  # a factor that slip or tyres do not explain
 
 
@@ -27,6 +28,7 @@ class Finding:
     """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``.
 
     size : of the fault, in the unit of the text; start_ns, end_ns : where it is, where it is not everywhere
+    convert : field of the stream `where` that is in another unit, and the factor to the right one
     """
 
     where: str
@@ -36,6 +38,7 @@ class Finding:
     size: float | None = None
     start_ns: int | None = None
     end_ns: int | None = None
+    convert: tuple[str, float] | None = None
 
     def __str__(self) -> str:
         return f"{self.where}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")
@@ -101,18 +104,25 @@ def fix_sigma(stream: Positioned) -> Floats:
     return np.asarray(np.linalg.norm(np.nan_to_num(stream.sigma[:, :2], nan=5.0), axis=1))
 
 
+def in_another_unit(where: str, text: str, remedy: str, field: str, factor: float) -> Finding:
+    """The finding of readings whose unit is known: converted on request, else not used."""
+    return Finding(where, text, f"{remedy}, or add --repair units", convert=(field, factor))
+
+
 def odd_speed(where: str, what: str, measured: Floats, known: Floats) -> Iterator[Finding]:
-    """Speeds (n,) of a sensor against those known from elsewhere (n,) m/s."""
+    """Speeds (n,) of a sensor, its field `what`, against those known from elsewhere (n,) m/s."""
     if len(measured) < LEAST_ROWS:
         return
     factor = float(np.median(measured / known))
     scatter = float(np.median(np.abs(measured / known - factor)))
     if 1.0 / _ODD < factor < _ODD or scatter > 0.3 * abs(factor):
         return
-    unit = next((name for f, name in _SPEEDS.items() if abs(factor / f - 1.0) < _NEAR), None)
-    looks = f": it looks like {unit}" if unit else ""
-    text = f"{what} is {factor:.3g} times the speed of the fixes{looks}"
-    yield Finding(where, text, f"divide {what} by {factor:.4g}" if unit is None else "give m/s")
+    text = f"{what} is {factor:.3g} times the speed of the fixes"
+    for known_factor, unit in _SPEEDS.items():
+        if abs(factor / known_factor - 1.0) < _NEAR:
+            yield in_another_unit(where, f"{text}: it looks like {unit}", "give m/s", what, 1.0 / known_factor)
+            return
+    yield Finding(where, text, f"divide {what} by {factor:.4g}")
 
 
 def over_chords(chords: Chords, t_ns: Times, values: Floats) -> Floats:
@@ -138,12 +148,13 @@ def count_of(n: int, noun: str, plural: str = "s") -> str:
     return f"{n} {noun}{'' if n == 1 else plural}"
 
 
-def period(imu: Imu) -> float:
-    """Median step of the stamps, s."""
-    return float(np.median(np.diff(imu.t_ns))) / NS
+def period(stream: Stream) -> float:
+    """Median step of the stamps, s; over some rows, which may arrive together."""
+    stride = min(_TOGETHER, len(stream) - 1)
+    return float(np.median(stream.t_ns[stride:] - stream.t_ns[:-stride])) / stride / NS
 
 
 def decimated(imu: Imu) -> Imu:
     """Every n-th row, to 50 Hz: enough for steps and turns."""
-    every = max(1, round(0.02 / period(imu)))
+    every = min(max(1, round(0.02 / period(imu))), max(1, len(imu) // LEAST_ROWS))
     return imu.take(slice(None, None, every)) if every > 1 else imu

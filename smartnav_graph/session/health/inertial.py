@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Indices, Mask
+from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.timebase import NS, nearest
 from smartnav_graph.session.health.facts import (
     CHORD_S,
@@ -17,14 +18,18 @@ from smartnav_graph.session.health.facts import (
     Finding,
     count_of,
     decimated,
+    in_another_unit,
     over_chords,
     period,
     repeats,
 )
 from smartnav_graph.session.streams import Imu
 
+_DEG = np.pi / 180
 _MAX_RATE = 35.0  # rad/s = 2000 deg/s, where consumer gyroscopes saturate
 _MAX_RMS_RATE = 10.0  # rad/s; a phone shaken by hand reaches 5
+_SPIKES = {"accel": 80.0, "gyro": 20.0}  # m/s^2, rad/s
+_SPIKE_ROWS = 200
 _FROZEN_S = 1.0  # six axes never repeat for so long
 _CLEAR_TURN = 0.4  # rad in some seconds
 _CORRELATED = 0.7  # correlation beyond chance
@@ -68,9 +73,11 @@ def _accel_unit(facts: Facts) -> Iterator[Finding]:
     median = float(np.median(np.linalg.norm(facts.imu.accel, axis=1)))
     g, found = facts.session.gravity, f"median |accel| {median:.3g} m/s^2, expected about {facts.session.gravity:.4g}"
     if abs(median - 1.0) < 0.2:
-        yield Finding("imu", f"{found}: it looks like units of g", "multiply accel by 9.80665")
+        text = f"{found}: it looks like units of g"
+        yield in_another_unit("imu", text, "multiply accel by 9.80665", "accel", STANDARD_GRAVITY)
     elif abs(median - g * g) < 0.2 * g * g:
-        yield Finding("imu", f"{found}: it looks scaled by 9.81 twice", "divide accel by 9.80665")
+        text = f"{found}: it looks scaled by 9.81 twice"
+        yield in_another_unit("imu", text, "divide accel by 9.80665", "accel", 1.0 / STANDARD_GRAVITY)
     elif median < 0.5 * g:
         yield Finding("imu", f"{found}: gravity seems removed", "import specific force, gravity included")
     elif median > 2.0 * g:
@@ -86,21 +93,21 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
     rate = np.linalg.norm(facts.imu.gyro, axis=1)
     high, rms = float(np.quantile(rate, 0.999)), float(np.sqrt((rate**2).mean()))
     errors = tilt_errors(facts.imu)
-    degrees = "multiply gyro by pi/180"
     if high > _MAX_RATE:
         text = f"99.9 % quantile of |gyro| is {high:.3g} rad/s, beyond 2000 deg/s: it looks like deg/s"
-        yield Finding("imu", text, degrees)
+        yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
     elif rms > _MAX_RMS_RATE:
-        yield Finding("imu", f"RMS |gyro| is {rms:.3g} rad/s: it looks like deg/s", degrees)
+        text = f"RMS |gyro| is {rms:.3g} rad/s: it looks like deg/s"
+        yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
     elif errors is not None and errors[1.0] > 20.0 and errors[np.pi / 180] < errors[1.0] / 4:
         text = f"integrated gyro turns gravity {errors[1.0]:.0f} deg away from accel within 2 s: it looks like deg/s"
-        yield Finding("imu", text, degrees)
+        yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
     elif errors is not None and errors[1.0] > 5.0 and errors[-1.0] < errors[1.0] / 4:
         text = "gyro turns against the tilt that accel shows: its sign is wrong"
         yield Finding("imu", text, "flip the sign of gyro")
     elif errors is not None and errors[1.0] > 5.0 and errors[180 / np.pi] < errors[1.0] / 4:
         text = "accel tilts 57.3 times faster than gyro turns: gyro looks converted from deg to rad twice"
-        yield Finding("imu", text, "multiply gyro by 180/pi")
+        yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 1.0 / _DEG)
 
 
 def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
@@ -151,7 +158,7 @@ def _gyro_course(facts: Facts) -> Iterator[Finding]:
     correlation, slope = _fit(course, gyro, np.abs(course) > _CLEAR_TURN)
     if correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the fixes turn {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
-        yield Finding("imu", text, "multiply gyro by 180/pi")
+        yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 1.0 / _DEG)
 
 
 def _fit(course: Floats, gyro: Floats, clear: Mask) -> tuple[float, float]:
@@ -200,6 +207,36 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
         yield Finding("imu", text, "sensor output frozen; remove the rows so that they count as a gap")
 
 
+def _spikes(facts: Facts) -> Iterator[Finding]:
+    """Single readings far from those before and after, which no motion leaves as they are."""
+    imu = facts.imu
+    if imu is None:
+        return
+    for name, rows in spikes(imu).items():
+        row = int(rows[0])
+        reading = np.abs(getattr(imu, name)[row]).max()
+        at, count = float(facts.session.seconds(imu.t_ns[row])), count_of(len(rows), "single reading")
+        text = f"{count} of {name} far from its neighbours, the first {reading:.4g} at row {row}, {at:.3f} s"
+        yield Finding("imu", text, "not used; interpolated between its neighbours")
+
+
+def spikes(imu: Imu) -> dict[str, Indices]:
+    """Rows of single readings of accel and gyro that differ from their four neighbours by more than twenty times what
+    99 of 100 readings do, and by more than a device can do from one sample to the next and back."""
+    found = {}
+    for name, least in _SPIKES.items():
+        values = getattr(imu, name)
+        if len(values) < _SPIKE_ROWS:
+            return {}
+        around = np.stack([values[:-4], values[1:-3], values[3:-1], values[4:]])
+        apart = np.abs(values[2:-2] - np.median(around, axis=0)).max(axis=1)
+        limit = max(least, 20.0 * float(np.quantile(apart, 0.99)))
+        rows = 2 + np.flatnonzero((apart > limit) & (apart > 5.0 * np.ptp(around, axis=0).max(axis=1)))
+        if len(rows):
+            found[name] = rows
+    return found
+
+
 def _clipped(facts: Facts) -> Iterator[Finding]:
     """Readings that repeat the largest value: the end of the range."""
     if facts.imu is None:
@@ -213,4 +250,4 @@ def _clipped(facts: Facts) -> Iterator[Finding]:
             yield Finding("imu", text, "choose a larger range when recording; the motion there is lost")
 
 
-RULES = (_accel_unit, _gyro_unit, _gyro_course, _frozen, _clipped, _gaps)
+RULES = (_accel_unit, _gyro_unit, _gyro_course, _frozen, _spikes, _clipped, _gaps)

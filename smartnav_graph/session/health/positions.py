@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.health.facts import (
     LEAST_ROWS,
     Facts,
@@ -24,6 +25,7 @@ from smartnav_graph.session.stream import Positioned
 _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
 _FAR_M = 50_000.0  # two sensors of one session
 _FROZEN_FIXES_S = 10.0
+_LARGE_SCATTER = 4.0  # times the stated sigma
 _HEIGHTS_M = (-500.0, 9000.0)  # of the Earth's land
 _GEOID_M = (8.0, 110.0)  # offsets of two heights that look like the geoid
 _ATTITUDE_PAIRS, _LEAST_PAIRS, _ATTITUDE_PAIR_S = 100, 5, 15.0
@@ -55,8 +57,29 @@ def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
         elif bad := int(np.isnan(stream.sigma).any(axis=1).sum()):
             text = f"{bad} of {len(stream)} rows have no sigma"
             yield Finding(name, text, "the default of the device class will be used there", "info")
+        flat = int((~stream.has_height).sum())
+        if flat:
+            text = f"{flat} of {len(stream)} rows have no height"
+            yield Finding(name, text, "used as horizontal fixes", "info" if flat < len(stream) else "warning")
         if facts.session.mount(name).frame == "msl":
             yield Finding(name, "heights are above mean sea level, not above the ellipsoid", level="info")
+
+
+def _scatter(facts: Facts) -> Iterator[Finding]:
+    """Stated sigmas against the scatter of the fixes beside a cubic through their neighbours."""
+    for name in ("gnss", "pose_fixes"):
+        stream = getattr(facts.session, name)
+        if stream is None or stream.sigma is None:
+            continue
+        position = facts.session.nav_position(stream)
+        for what, axes in (("horizontally", slice(0, 2)), ("in height", slice(2, 3))):
+            stated = stream.sigma[:, axes]
+            rows = np.isfinite(stated).all(axis=1) & (stream.has_height | (axes.start == 0))
+            found = scatter(stream.t_ns[rows], position[rows, axes]) if rows.any() else None
+            ratio = 0.0 if found is None else found.sigma / float(np.sqrt(np.median(stated[rows] ** 2)))
+            if found is not None and found.is_noise and ratio > _LARGE_SCATTER:
+                text = f"fixes scatter {found.sigma:.2g} m {what}, {ratio:.0f} times their stated sigma"
+                yield Finding(name, text, "check the unit of the sigma columns, or leave them out")
 
 
 def _exchanged(facts: Facts) -> Iterator[Finding]:
@@ -79,7 +102,7 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
     for name, lla in _geodetic(facts).items():
         if np.abs(lla[:, 0]).max() < np.pi / 2 and np.abs(lla[:, 1]).max() < np.pi:
             text = "latitudes and longitudes are all within pi of zero, where there is no land: they look like radians"
-            yield Finding(name, text, "give degrees")
+            yield Finding(name, text, "give degrees", "error")
 
 
 def _geodetic(facts: Facts) -> dict[str, Floats]:
@@ -97,7 +120,9 @@ def _degrees_apart(one: Floats, other: Floats) -> float:
 
 def _heights(facts: Facts) -> Iterator[Finding]:
     for name, lla in _geodetic(facts).items():
-        height = lla[:, 2]
+        height = lla[np.isfinite(lla[:, 2]), 2]
+        if not len(height):
+            continue
         if len(height) >= LEAST_ROWS and not height.any():
             yield Finding(name, "height_m is zero in all rows", "the log holds no heights; give large sigma_u_m")
         elif not _HEIGHTS_M[0] < float(np.median(height)) < _HEIGHTS_M[1]:
@@ -211,4 +236,4 @@ def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:
     return turn
 
 
-RULES = (_jumps, _exchanged, _heights, _frozen, _velocities, _attitudes, _sigmas_and_heights)
+RULES = (_jumps, _scatter, _exchanged, _heights, _frozen, _velocities, _attitudes, _sigmas_and_heights)

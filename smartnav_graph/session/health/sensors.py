@@ -9,9 +9,19 @@ from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.so3 import exp, rotate
+from smartnav_graph.core.so3 import exp, rotate, skew
 from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.session.health.facts import LEAST_ROWS, Facts, Finding, count_of, odd_speed, over_chords, repeats
+from smartnav_graph.session.health.facts import (
+    LEAST_ROWS,
+    Facts,
+    Finding,
+    count_of,
+    in_another_unit,
+    odd_speed,
+    over_chords,
+    period,
+    repeats,
+)
 
 _EARTH_UT = (22.0, 67.0)  # of the geomagnetic field at the ground
 _FIELD_UNITS = {1e-6: "tesla", 1e-3: "millitesla", 1e-2: "gauss", 1e1: "milligauss", 1e3: "nanotesla"}
@@ -20,6 +30,8 @@ _PRESSURE_HPA = (300.0, 1100.0)
 _WEATHER = 0.06  # share of the pressure
 _MAX_SPEED = 100.0  # m/s
 _FROZEN_FIELD_S = 10.0
+_TURN_S = 0.5
+_CLEAR_TURNS = 0.3  # rad: root of the sum of the squared turns about the axis with the fewest
 _CORRELATED = 0.4  # correlation beyond chance
 _TURNS = 0.3  # rad/s, scatter of the rate of a device in motion
 
@@ -32,11 +44,14 @@ def _field(facts: Facts) -> Iterator[Finding]:
     expected = facts.session.magnetic_field_ut
     low, high = _EARTH_UT
     near = f"{np.linalg.norm(expected):.0f} uT here" if expected is not None else f"{low:.0f} to {high:.0f} uT on Earth"
+    turning = _turning_field(facts)
     for factor, unit in _FIELD_UNITS.items():
-        if low <= size / factor <= high:
-            yield Finding(
-                "magnetometer", f"median |field| {size:.3g} uT, expected {near}: it looks like {unit}", "give uT"
-            )
+        looks = low <= size / factor <= high
+        if unit == "milligauss" and turning is not None:  # the hard iron of a phone may be as large
+            looks = high < turning <= factor * high
+        if looks:
+            text = f"median |field| {size:.3g} uT, expected {near}: it looks like {unit}"
+            yield in_another_unit("magnetometer", text, "give uT", "field_ut", 1.0 / factor)
             return
     if not 0.3 * low < size < 3.0 * high:
         text = f"median |field| {size:.4g} uT, expected {near}"
@@ -50,6 +65,34 @@ def _field(facts: Facts) -> Iterator[Finding]:
                 "magnetometer", f"repeats one reading for {seconds:.0f} s from {at:.1f} s on", "sensor output frozen"
             )
             return
+
+
+def _turning_field(facts: Facts) -> float | None:
+    """Size (uT) of the field that turns in the body: of B - h, with dB = -dtheta x (B - h), about the axes that the
+    device turns about. None where it does not turn enough to find the offset h."""
+    stream, imu = facts.session.magnetometer, facts.imu
+    if stream is None or imu is None:
+        return None
+    stream = stream.take((stream.t_ns >= imu.t_ns[0]) & (stream.t_ns <= imu.t_ns[-1]))
+    if len(stream) < LEAST_ROWS:
+        return None
+    every = max(1, round(_TURN_S / period(stream)))
+    field, t_ns = uniform_filter1d(stream.field_ut, every, axis=0)[::every], stream.t_ns[::every]
+    angle = np.cumsum(imu.gyro * np.diff(imu.t_ns, prepend=imu.t_ns[0])[:, None] / NS, axis=0)
+    half = round(0.5 * every * period(stream) * NS)
+    angle = interpolate(t_ns + half, imu.t_ns, angle) + interpolate(t_ns - half, imu.t_ns, angle)
+    turn, change, middle = 0.5 * np.diff(angle, axis=0), np.diff(field, axis=0), 0.5 * (field[1:] + field[:-1])
+    A, b = skew(turn).reshape(-1, 3), (change + np.cross(turn, middle)).ravel()
+    _, singular, axes = np.linalg.svd(A, full_matrices=False)
+    turned = singular > _CLEAR_TURNS
+    axes = axes[turned]
+    if len(axes) < 2:
+        return None
+    h = np.linalg.lstsq(A @ axes.T, b, rcond=None)[0]
+    left = b - A @ axes.T @ h
+    size = float(np.median(np.linalg.norm(field @ axes.T - h, axis=1)))
+    sigma = float(np.sqrt(left @ left / len(left)) / singular[turned].min())
+    return size if sigma < 0.2 * size else None
 
 
 def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
@@ -95,7 +138,7 @@ def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
         yield Finding("magnetometer", text, "give the field in body axes, right-handed")
     elif correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
-        yield Finding("imu", text, "multiply gyro by 180/pi")
+        yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 180.0 / np.pi)
 
 
 def _pressure(facts: Facts) -> Iterator[Finding]:
@@ -111,10 +154,13 @@ def _pressure(facts: Facts) -> Iterator[Finding]:
     if not right:
         centre = expected if expected is not None else 980.0
         share = _WEATHER if expected is not None else 0.25
-        unit = next((name for f, name in _PRESSURE_UNITS.items() if abs(median / f / centre - 1.0) < share), None)
-        looks = f": it looks like {unit}" if unit else ""
-        text = f"median pressure {median:.5g} hPa, expected {wanted}{looks}"
-        yield Finding("barometer", text, "give hPa" if unit else "check unit and [origin] height_m")
+        text = f"median pressure {median:.5g} hPa, expected {wanted}"
+        for factor, unit in _PRESSURE_UNITS.items():
+            if abs(median / factor / centre - 1.0) < share:
+                text = f"{text}: it looks like {unit}"
+                yield in_another_unit("barometer", text, "give hPa", "pressure_hpa", 1.0 / factor)
+                return
+        yield Finding("barometer", text, "check unit and [origin] height_m")
 
 
 def _temperature(facts: Facts) -> Iterator[Finding]:

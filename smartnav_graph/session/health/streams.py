@@ -14,6 +14,7 @@ from smartnav_graph.session.streams import ABSOLUTE, StaticPeriod
 
 _MOST_RATE_HZ = 8000.0  # of an IMU that people have
 _UNITS = {"microseconds": 3, "milliseconds": 6, "seconds": 9}
+_SLOW_HZ = 20.0
 _UNIX_FROM, _UNIX_TO = 631_152_000 * NS, 4_102_444_800 * NS  # 1990 to 2100
 
 
@@ -61,9 +62,15 @@ def _clock(facts: Facts) -> Iterator[Finding]:
     if session.clock_epoch == "unix" and not _UNIX_FROM <= session.t0_ns <= _UNIX_TO:
         text = f"epoch is unix, but time zero is {session.t0_ns} ns, outside 1990 to 2100"
         yield Finding("session.toml [clock]", text, "check the unit of t_ns, or set another epoch")
-    if facts.imu is not None and not 1.0 <= (rate := 1.0 / period(facts.imu)) <= 20_000.0:
+    if facts.imu is None:
+        return
+    rate = 1.0 / period(facts.imu)
+    if not 1.0 <= rate <= 20_000.0:
         text = f"median rate {rate:.4g} Hz is outside 1 Hz to 20 kHz"
         yield Finding("imu", text, "t_ns counts nanoseconds; check the unit of the time stamps")
+    elif rate < _SLOW_HZ:
+        text = f"median rate {rate:.3g} Hz is too low to follow the motion between samples"
+        yield Finding("imu", text, f"record at {_SLOW_HZ:g} Hz at least; attitude and speed are uncertain")
 
 
 def _constant(facts: Facts) -> Iterator[Finding]:
