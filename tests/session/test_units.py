@@ -60,7 +60,7 @@ def test_without_the_repair_they_are_not_used(car, name):
 
 @pytest.mark.parametrize("field", ["gyro", "accel"])
 def test_inertial_data_in_another_unit_are_refused(car, field):
-    with pytest.raises(SessionError, match="multiply .*, or add --repair units"):
+    with pytest.raises(SessionError, match=r"multiply .*, or add --repair units"):
         prepare(changed(car, "imu", **{field: WRONG["imu"][field]}), Config())
 
 
@@ -77,13 +77,10 @@ def test_the_repair_of_a_folder(car, tmp_path):
 
 def test_hard_iron_is_no_milligauss(car):
     """An offset of some hundreds of microtesla does not turn with the device; milligauss do."""
-    iron = car.replace(
-        magnetometer=replace(car.magnetometer, field_ut=car.magnetometer.field_ut + [300.0, -150.0, 200.0])
-    )
+    field, offset = car.magnetometer.field_ut, np.array([300.0, -150.0, 200.0])
+    iron = car.replace(magnetometer=replace(car.magnetometer, field_ut=field + offset))
     assert any("calibrate its hard iron" in text for text in inspect(iron).warnings())
-    both = changed(iron, "magnetometer", field_ut=1.0).replace(
-        magnetometer=replace(car.magnetometer, field_ut=10.0 * car.magnetometer.field_ut + [300.0, -150.0, 200.0])
-    )
+    both = car.replace(magnetometer=replace(car.magnetometer, field_ut=10.0 * field + offset))
     assert any("it looks like milligauss" in text for text in inspect(both).warnings())
 
 
