@@ -135,7 +135,7 @@ def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Float
     score = np.zeros(len(lags))
     for begin, end, d in (fixes.chords(1), fixes.chords(max(1, round(_LONG_CHORD_S / fixes.spacing_s)))):
         square, middle = d**2, 0.5 * (begin + end)
-        blocks = np.array_split(np.arange(len(d)), max(1, round((middle[-1] - middle[0]) / _BLOCK_S)))
+        blocks = np.array_split(np.arange(len(d)), np.clip(round((middle[-1] - middle[0]) / _BLOCK_S), 1, len(d)))
         for part in np.array_split(np.arange(len(lags)), -(-len(lags) // 500)):
             lag = lags[part, None]
             mean = (_at(axis, (end - lag) / STEP_S) - _at(axis, (begin - lag) / STEP_S)) / (end - begin)
