@@ -132,6 +132,11 @@ def kelvin(session: Session) -> Session:
     return session.replace(temperature=Temperature(t_ns=t_ns, temperature_c=np.linspace(300.0, 310.0, len(t_ns))))
 
 
+def repeated_fixes(session: Session) -> Session:
+    """Every row of the log holds the fix of the last five seconds."""
+    return session.replace(gnss=replace(session.gnss, lla=session.gnss.lla[np.arange(len(session.gnss)) // 5 * 5]))
+
+
 CAR, WALK = "car-all-2min", "walk-all-2min"
 FAULTS = [
     ("car-10min", scaled("imu", "gyro", -1.0), "imu: gyro turns against", "flip the sign of gyro"),
@@ -146,6 +151,7 @@ FAULTS = [
     (CAR, clipped, "|accel| is 19.61 in", "larger range"),
     (CAR, exchanged, "and near it with latitude and longitude exchanged", "exchange lat_deg and lon_deg"),
     (CAR, radians, "they look like radians", "give degrees"),
+    (CAR, repeated_fixes, "rows repeat the fix before, at", "remove the rows without a new fix"),
     (CAR, no_heights, "gnss: height_m is zero in all rows", "holds no heights"),
     (
         CAR,

@@ -26,6 +26,7 @@ _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
 _FAR_M = 50_000.0  # two sensors of one session
 _FROZEN_FIXES_S = 10.0
 _LARGE_SCATTER = 4.0  # times the stated sigma
+_STALE_SPEED, _STALE_SHARE = 1.0, 0.2  # m/s between fixes, share of rows
 _HEIGHTS_M = (-500.0, 9000.0)  # of the Earth's land
 _GEOID_M = (8.0, 110.0)  # offsets of two heights that look like the geoid
 _ATTITUDE_PAIRS, _LEAST_PAIRS, _ATTITUDE_PAIR_S = 100, 5, 15.0
@@ -159,6 +160,25 @@ def _frozen(facts: Facts) -> Iterator[Finding]:
                 yield Finding(name, text, "receiver output frozen; remove the repeated rows")
 
 
+def _stale(facts: Facts) -> Iterator[Finding]:
+    """Rows that repeat the fix before, in a stream whose fixes move: a log with more rows than fixes."""
+    for name in ("gnss", "pose_fixes"):
+        stream = getattr(facts.session, name)
+        if stream is None or len(stream) < LEAST_ROWS:
+            continue
+        position = facts.session.nav_position(stream)[:, :2]
+        fixes = np.flatnonzero(np.concatenate([[True], np.diff(position, axis=0).any(axis=1)]))
+        if len(fixes) < 2:
+            continue
+        step = np.linalg.norm(np.diff(position[fixes], axis=0), axis=1)
+        speed = step / np.maximum(np.diff(stream.t_ns[fixes]) / NS, 1e-9)
+        moving = speed > _STALE_SPEED
+        rows = int((np.diff(fixes) - 1)[moving].sum())
+        if rows >= LEAST_ROWS and rows > _STALE_SHARE * len(stream):
+            text = f"{rows} of {len(stream)} rows repeat the fix before, at {np.median(speed[moving]):.1f} m/s"
+            yield Finding(name, text, "remove the rows without a new fix", size=round(rows / len(stream), 3))
+
+
 def _moves(facts: Facts, span: Times) -> bool:
     """Whether rate or force in a time span scatter more than at rest."""
     imu = facts.imu
@@ -236,4 +256,4 @@ def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:
     return turn
 
 
-RULES = (_jumps, _scatter, _exchanged, _heights, _frozen, _velocities, _attitudes, _sigmas_and_heights)
+RULES = (_jumps, _scatter, _exchanged, _heights, _frozen, _stale, _velocities, _attitudes, _sigmas_and_heights)
