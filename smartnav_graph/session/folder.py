@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from smartnav_graph.core.arrays import Column
@@ -59,10 +60,15 @@ def _header(session: Session) -> dict[str, object]:
     if session.origin is not None:
         header["origin"] = dataclasses.asdict(session.origin)
     if session.sensors:
-        header["sensors"] = {name: dataclasses.asdict(mount) for name, mount in session.sensors.items()}
+        header["sensors"] = {name: _mount_table(mount) for name, mount in session.sensors.items()}
     if session.calibration is not None:
         header["calibration"] = "calibration.toml"
     return header
+
+
+def _mount_table(mount: Mount) -> dict[str, object]:
+    table = dataclasses.asdict(mount)
+    return table if np.isfinite(mount.geoid_m) else {name: value for name, value in table.items() if name != "geoid_m"}
 
 
 def build_stream(

@@ -50,12 +50,19 @@ class Device:
 class Mount:
     """Where a sensor is mounted: `body_t` (3,) m its origin in body axes, `body_R` (3, 3) its axes; `frame` a label.
 
-    For position sensors ``frame = "msl"`` says that heights are above mean sea level.
+    For position sensors ``frame = "msl"`` says that height_m is above mean sea level; `geoid_m` is then the height of the
+    geoid above the ellipsoid there, m.
     """
 
     body_t: tuple[float, float, float] = (0.0, 0.0, 0.0)
     body_R: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     frame: str = ""
+    geoid_m: float = float("nan")
+
+    @property
+    def above_sea(self) -> bool:
+        """Whether heights are above mean sea level."""
+        return self.frame == "msl"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +145,9 @@ class Session(Streams):
         if stream.enu is not None:
             return rows
         assert self.frame is not None  # checked when the session was built
+        mount = self.mount(stream.NAME)
+        if mount.above_sea and np.isfinite(mount.geoid_m):
+            rows = np.column_stack([rows[:, :2], rows[:, 2] + np.where(known, mount.geoid_m, 0.0)])
         return self.frame.nav_from_lla(rows)
 
     @property

@@ -15,6 +15,7 @@ from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.session import folder
 from smartnav_graph.session.health import inspect
 from smartnav_graph.session.health.units import in_right_units
+from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import GnssFix
 
 DEG, G = 180.0 / np.pi, 9.80665
@@ -146,3 +147,15 @@ def test_one_spike_of_the_accelerometer_does_not_move_the_path():
     found = sn.run(session.replace(imu=replace(session.imu, accel=accel)))
     assert any("at row 3000, 30.000 s" in text for text in found.summary["warnings"])
     assert np.abs(found.solution.nav_t_body - clean.nav_t_body).max() < 0.05  # m; one row of 6000 is missing
+
+
+def test_heights_above_the_sea_need_the_geoid_and_are_lifted_by_it(tmp_path):
+    session = sn.simulate("figure-eight-60s", 1)
+    lla = session.gnss.lla - [0.0, 0.0, 46.5]
+    above_sea = session.replace(gnss=replace(session.gnss, lla=lla), sensors={"gnss": Mount(frame="msl")})
+    with pytest.raises(SessionError, match="height of the geoid is not known; give geoid_m"):
+        prepare(above_sea, Config())
+    folder.save(above_sea.replace(sensors={"gnss": Mount(frame="msl", geoid_m=46.5)}), tmp_path / "s")
+    known = folder.load(tmp_path / "s")
+    np.testing.assert_allclose(known.nav_position(known.gnss), session.nav_position(session.gnss), atol=1e-6)  # m
+    prepare(known, Config())

@@ -62,7 +62,13 @@ def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
         if flat:
             text = f"{flat} of {len(stream)} rows have no height"
             yield Finding(name, text, "used as horizontal fixes", "info" if flat < len(stream) else "warning")
-        if facts.session.mount(name).frame == "msl":
+        mount = facts.session.mount(name)
+        if mount.above_sea and stream.lla is not None and not np.isfinite(mount.geoid_m):
+            remedy = (
+                f'give geoid_m in [sensors.{name}], the height of the geoid above the ellipsoid there, or frame = ""'
+            )
+            yield Finding(name, 'frame = "msl", but the height of the geoid is not known', remedy, "error")
+        elif mount.above_sea:
             yield Finding(name, "heights are above mean sea level, not above the ellipsoid", level="info")
 
 
