@@ -50,8 +50,8 @@ class Device:
 class Mount:
     """Where a sensor is mounted: `body_t` (3,) m its origin in body axes, `body_R` (3, 3) its axes; `frame` a label.
 
-    For position sensors ``frame = "msl"`` says that height_m is above mean sea level; `geoid_m` is then the height of the
-    geoid above the ellipsoid there, m.
+    For position sensors ``frame = "msl"`` says that height_m is above mean sea level; `geoid_m` is then the height of
+    the geoid above the ellipsoid there, m.
     """
 
     body_t: tuple[float, float, float] = (0.0, 0.0, 0.0)
