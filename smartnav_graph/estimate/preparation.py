@@ -244,6 +244,14 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
     notes.rests = find_standstills(
         imu, session.static, notes.gaps, vehicle, noise, gravity, options, seen, available_ns
     )
+    if options.mounting == "foot" and options.detect and not notes.rests.still.any():
+        raise SessionError(
+            "imu",
+            "the device is declared to be mounted on a foot, and no stance was found",
+            "a foot that stands on the ground in each stride, sampled at 50 Hz or more",
+            "check the units of the inertial data with `smartnav info`, or give --standstill.mounting body",
+            stream="imu",
+        )
     return session
 
 

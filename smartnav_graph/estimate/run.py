@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
+import numpy as np
 
+from smartnav_graph.core import frames
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.core.progress import Progress, silent
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.alignment.initialiser import find_initial_state
 from smartnav_graph.estimate.alignment.inputs import first_stretch
@@ -26,8 +29,9 @@ from smartnav_graph.estimate.result.assemble import (
 )
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
 from smartnav_graph.estimate.result.summary import summarise
+from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.prior import PriorBuilder
-from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.session import Session
@@ -64,7 +68,29 @@ def initialise(problem: Problem, longest_s: float | None = None) -> InitialState
         windows = problem.windows[:count]
         return solve_passes(problem, windows, prior, pass_state, initial_values=initial_values, coarse_start=True)[:2]
 
-    return find_initial_state(first_stretch(problem, longest_s), solve)
+    return _with_second_stage(problem, find_initial_state(first_stretch(problem, longest_s), solve))
+
+
+def _with_second_stage(problem: Problem, initial: InitialState) -> InitialState:
+    """The start with a sigma of its heading that covers what the first stage leaves out: the heading is found once more
+    with clock offsets and correlated errors of the fixes as states, and what it changes by counts as an error."""
+    if initial.method not in ("dynamic", "static") or not problem.session.positions():
+        return initial
+    end_ns = problem.windows[0].t1_ns + round(initial.stretch_s * NS)
+    windows = [window for window in problem.windows if window.t1_ns <= end_ns]
+    correlated = frozenset(
+        b.name for b in position_builders(problem.builders) if b.has_correlated_error(initial.pass_state)
+    )
+    pass_state = replace(initial.pass_state, stage=LAST_STAGE, correlated=correlated)
+    try:
+        estimate, _, _ = solve_passes(problem, windows, initial.prior, pass_state, first_s=initial.stretch_s)
+    except SolverError:
+        return initial
+    device = problem.session.device
+    heading = frames.heading_pitch_roll_deg(estimate.states()[0][0], device.forward, device.up)[0, 0]
+    sigma = float(np.degrees(np.sqrt(estimate.covariance[0, 2, 2])))
+    change = float((heading - initial.heading_deg + 180.0) % 360.0 - 180.0)
+    return initial.with_sigma(float(np.hypot(max(sigma, initial.sigma_heading_deg), change)))
 
 
 def smooth(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -74,6 +74,11 @@ class InitialState:
     starts: int
     pass_state: PassState
     initial_values: gtsam.Values | None = None
+
+    def with_sigma(self, sigma_deg: float) -> InitialState:
+        """The same with another sigma (deg) of its heading."""
+        was, now = (f"deg +- {sigma:.1f} deg" for sigma in (self.sigma_heading_deg, min(sigma_deg, 180.0)))
+        return replace(self, sentence=self.sentence.replace(was, now), sigma_heading_deg=min(sigma_deg, 180.0))
 
     def to_dict(self) -> dict[str, Any]:
         return {

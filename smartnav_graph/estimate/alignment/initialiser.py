@@ -30,6 +30,9 @@ GOOD_COST = 2.5
 REJECTION_COST = 10.0
 # A heading (deg) with a smaller sigma than this is known.
 GOOD_HEADING_DEG = 10.0
+# Squares of fixes count once in so many where starts are compared, as their errors are correlated, and in units of
+# their mean, at least of this.
+CORRELATED, LEAST_SCATTER = 4.0, 0.03
 # Share of the keyframes whose fixes a good start may reject beyond those that disagreed with it before.
 MORE_REJECTED = 0.05
 
@@ -90,9 +93,10 @@ def _search(first: FirstStretch, solve: Solve) -> InitialState:
         stretch = first.until(stretch_s)
         last = stretch_s >= config.max_stretch_s or stretch.count >= len(first.windows)
         results: list[Refined] = []
-        for state, pass_state in _by_agreement(stretch, before):
+        agreed = _by_agreement(stretch, before)
+        for one in agreed:
             tried += 1
-            found = _refine(stretch, state, pass_state, solve)
+            found = _refine(stretch, _state(stretch, one), _without_outliers(stretch, one), solve)
             if found is not None:
                 results.append(found)
                 if found.fits and (not last or found.initial.sigma_heading_deg < GOOD_HEADING_DEG):
@@ -100,7 +104,7 @@ def _search(first: FirstStretch, solve: Solve) -> InitialState:
         if results:
             best = min(results, key=lambda result: result.cost).initial
             if last or best.sigma_heading_deg < GOOD_HEADING_DEG:
-                return replace(best, starts=tried)
+                return replace(_with_ambiguity(stretch, best, agreed), starts=tried)
             before = [best.prior.start]
         elif last:
             raise SolverError(
@@ -112,8 +116,22 @@ def _search(first: FirstStretch, solve: Solve) -> InitialState:
         stretch_s *= 2.0
 
 
-def _by_agreement(first: FirstStretch, before: Sequence[State]) -> list[tuple[State, PassState]]:
-    """First states to try, those that most fixes agree on first, with a pass state that rejects the other fixes.
+def _with_ambiguity(first: FirstStretch, initial: InitialState, agreed: Sequence[Alignment]) -> InitialState:
+    """The start with a sigma of its heading that covers the other states on which the fixes agree nearly as well."""
+    cost = np.array([one.cost for one in agreed])
+    other = np.array([first.heading_deg(one.R) for one in agreed])
+    off = (other - initial.heading_deg + 180.0) % 360.0 - 180.0
+    scatter = np.clip(cost.min() / max(3.0 * len(first.known) - 9.0, 1.0), LEAST_SCATTER, 1.0)
+    weight = np.exp(-0.5 * (cost - cost.min()) / (CORRELATED * scatter))
+    return initial.with_sigma(float(np.hypot(initial.sigma_heading_deg, np.sqrt(weight @ off**2 / weight.sum()))))
+
+
+def _state(first: FirstStretch, one: Alignment) -> State:
+    return State.of(0, first.start_ns, (one.R, one.p, one.v), one.found[:6])
+
+
+def _by_agreement(first: FirstStretch, before: Sequence[State]) -> list[Alignment]:
+    """First states to try, those that most fixes agree on first.
 
     before : the best of a shorter stretch, tried first
     """
@@ -128,11 +146,7 @@ def _by_agreement(first: FirstStretch, before: Sequence[State]) -> list[tuple[St
     starts = [(s.nav.attitude().matrix(), s.nav.position(), s.nav.velocity()) for s in states]
     bias = states[0].bias.vector() if before or first.field_start is not None else None
     windows, t_ns, fixes = first.windows[: first.count], first.fixes.t_ns[used], first.fixes.position[used]
-    found = starts_agreed(windows, t_ns, fixes, starts, known, bias)[: first.config.starts]
-    return [
-        (State.of(0, first.start_ns, (one.R, one.p, one.v), one.found[:6]), _without_outliers(first, one))
-        for one in found
-    ]
+    return starts_agreed(windows, t_ns, fixes, starts, known, bias)[: first.config.starts]
 
 
 def _without_outliers(first: FirstStretch, alignment: Alignment) -> PassState:

@@ -1,5 +1,6 @@
 """Standstills: rests between motions, stances of a synthetic foot, listed periods, and what is none."""
 
+import gzip
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from smartnav_graph import readers
 from smartnav_graph.core.arrays import runs
-from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.estimate.config import Config, RunConfig
 from smartnav_graph.estimate.problem import prepare
@@ -195,12 +196,12 @@ def test_a_walking_foot_is_recognised(dataset, walk):
 
 
 @pytest.mark.parametrize("walk", ["2017-11-22-11-27-30", "2017-11-27-11-25-12"])
-def test_the_reader_declares_the_foot_of_a_runner_and_of_a_slow_walker(dataset, walk):
-    """Their stances are too rare to show the mounting."""
+def test_a_runner_and_a_slow_walker_are_recognised(dataset, walk):
+    """Without the declaration of the reader too."""
     file = dataset("foot_pyshoe_vicon") / f"{walk}_LLIO.mat"
     if not file.exists():
         pytest.skip(f"{file.name} is not there")
-    assert not on_foot(file)
+    assert on_foot(file)
     rests = prepare(readers.read(file), Config(run=RunConfig(initial="0,0,0,0"))).rests
     assert rests is not None and rests.on_foot
 
@@ -297,3 +298,27 @@ def test_stamps_inside_a_standstill_do_not_wait_for_its_end():
     rests = [Standstills(t_ns[:n], np.zeros(n), np.zeros(n)) for n in (48, 101)]
     early, late = (rest.keyframes(0.9, causal=True) / NS for rest in rests)
     assert early[:-1].tolist() == late[: len(early) - 1].tolist() == pytest.approx([0, 0.9, 1.8, 2.7, 3.6, 4.5])
+
+
+def phones(folder):
+    """Specific force and rate of phones carried in many ways, on one clock each."""
+    for file in sorted(folder.glob("*.csv.gz")):
+        lines = [line.split(",") for line in gzip.decompress(file.read_bytes()).decode().splitlines()]
+        force, rate = (np.array([row[1:] for row in lines if row[0] == name], dtype=float) for name in ("acce", "gyro"))
+        force = force[np.concatenate([[True], np.diff(force[:, 0]) > 0])]
+        gyro = np.stack([np.interp(force[:, 0], rate[:, 0], column) for column in rate.T[1:]], axis=-1)
+        yield file.name, Imu(t_ns=(force[:, 0] * NS).astype(np.int64), accel=force[:, 1:], gyro=gyro)
+
+
+@pytest.mark.slow
+def test_phones_that_walk_and_run_are_on_no_foot(dataset):
+    assert not [name for name, imu in phones(dataset("phone_placements")) if found(imu, "foot").on_foot]
+
+
+def test_a_declared_foot_without_a_stance_is_an_error():
+    session = simulate("phone-car-5min")
+    device = replace(session.device, mounting="foot", vehicle="none")
+    t_ns = session.imu.t_ns
+    shaken = replace(session.imu, gyro=5.0 + np.random.default_rng(0).normal(size=(len(t_ns), 3)))
+    with pytest.raises(SessionError, match="no stance was found"):
+        prepare(session.replace(device=device, imu=shaken, static=None), Config())
