@@ -37,6 +37,9 @@ from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers.estimate import Estimate
 
+# Passes of the second stage that the sigma of the first heading takes.
+SECOND_STAGE_PASSES = 2
+
 
 @dataclass(frozen=True)
 class Run:
@@ -82,8 +85,10 @@ def _with_second_stage(problem: Problem, initial: InitialState) -> InitialState:
         b.name for b in position_builders(problem.builders) if b.has_correlated_error(initial.pass_state)
     )
     pass_state = replace(initial.pass_state, stage=LAST_STAGE, correlated=correlated)
+    run = replace(problem.config.run, passes=SECOND_STAGE_PASSES)
+    short = replace(problem, config=replace(problem.config, run=run))
     try:
-        estimate, _, _ = solve_passes(problem, windows, initial.prior, pass_state, first_s=initial.stretch_s)
+        estimate, _, _ = solve_passes(short, windows, initial.prior, pass_state, first_s=initial.stretch_s)
     except SolverError:
         return initial
     device = problem.session.device
