@@ -248,7 +248,7 @@ def detect_standstills(session: Session, notes: Notes) -> Session:
         raise SessionError(
             "imu",
             "the device is declared to be mounted on a foot, and no stance was found",
-            "a foot that stands on the ground in each stride, sampled at 50 Hz or more",
+            "a foot on the ground once in each stride, sampled at 50 Hz or more",
             "check the units of the inertial data with `smartnav info`, or give --standstill.mounting body",
             stream="imu",
         )
