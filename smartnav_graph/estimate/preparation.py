@@ -21,6 +21,7 @@ from smartnav_graph.session.detect.moving import Moving, find_moving, without_mo
 from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
+from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.health.inertial import spikes
 from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
@@ -44,6 +45,7 @@ class Notes:
     span: tuple[int, int] = (0, 0)
     gaps: Sequence[Gap] = ()
     clocks: ClockReport = ClockReport()
+    findings: Sequence[Finding] = ()
     calibration: Calibration = field(default_factory=Calibration)
     withheld: Mapping[str, Positioned] = field(default_factory=dict)
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -124,6 +126,7 @@ def check_health(session: Session, notes: Notes) -> Session:
     checked = health.inspect(session, notes.gaps, notes.clocks)
     checked.raise_errors()
     notes.warnings += checked.warnings()
+    notes.findings = [finding for finding in checked.findings if finding.level == "warning"]
     session, wrong = without_wrong_units(session, checked.findings)
     notes.warnings += [f"{name}: not used, because it is in another unit" for name in wrong]
     return session

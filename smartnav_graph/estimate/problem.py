@@ -20,6 +20,7 @@ from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.health.clocks import ClockReport
+from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import Imu
@@ -47,6 +48,7 @@ class Problem:
     rests: Standstills | None = None
     pairs: Pairs | None = None
     clocks: ClockReport = ClockReport()
+    findings: Sequence[Finding] = ()
 
     @property
     def vehicle(self) -> str:
@@ -102,7 +104,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     notes.warnings += [dropped_text(name, counts) for name, counts in notes.dropped.items()]
     return Problem(
         *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
-        *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks),
+        *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks, notes.findings),
     )
 
 

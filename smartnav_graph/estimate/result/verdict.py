@@ -1,0 +1,204 @@
+"""The verdict of a run: good, doubtful or contradictory, with its reasons.
+
+Its tests are none that the estimate made itself: every sensor's chi-square by its own redundancy, how far the noise,
+clock and biases found lie from what was known of them before, which fixes were rejected, whether residuals of
+neighbouring fixes are alike, withheld fixes against interpolation of the kept ones, and what the recording showed before
+the graph was built.
+
+contradictory : measurements exclude each other, or the result is no trajectory of this device
+doubtful : the result may be wrong by more than its covariance says
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from smartnav_graph.core.arrays import Floats, runs
+from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
+from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
+from smartnav_graph.estimate.reweight.imu_noise import WIDEST_OF_SAMPLES, WORSE, worse_than_class
+from smartnav_graph.estimate.reweight.outliers import FixResiduals
+from smartnav_graph.factors.imu import ImuBuilder
+from smartnav_graph.graph.update import one_of
+
+LEVELS = ("good", "doubtful", "contradictory")
+# Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
+MISFIT, EXCLUDED = 2.0, 6.0
+# How rarely a sensor that fits reaches its chi-square.
+RARE = 1e-6
+# Consecutive rejected fixes, seconds of them, and share of all, that speak against the solution rather than the fixes.
+REJECTED_RUN, REJECTED_S, REJECTED_SHARE, MOST_REJECTED = 4, 3.0, 0.1, 0.3
+# Receivers are late by less, s.
+LATE_S = 1.2
+# Biases beyond so many sigmas of what was known of them.
+FAR = 4.0
+# Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
+ALIKE, LEAST_PAIRS = 0.35, 40
+# RMS at withheld fixes against that of interpolating the kept ones; share of them inside 95 %.
+WORSE_THAN_INTERPOLATION, LEAST_INSIDE, LEAST_WITHHELD = 1.1, 0.8, 20
+# Findings on the recording that put its geometry in doubt.
+AXES = ("axes", "axis", "turns against", "mirrored", "swapped", "north, east, down", "opposite", "left-handed")
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a run is not good. start_s, end_s since time zero, None for all of it; size : of the fault, in the unit of
+    the text."""
+
+    level: str
+    sensor: str
+    text: str
+    remedy: str
+    size: float | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in summary.json."""
+        return {name: round(value, 4) if isinstance(value, float) else value for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the tests look at."""
+
+    solved: SolvedProblem
+    fit: Chi2
+    withheld: Mapping[str, Withheld]
+    together: bool
+
+
+Test = Callable[[Facts], Iterator[Reason]]
+
+
+def verdict(facts: Facts) -> dict[str, Any]:
+    """The verdict as in summary.json: level, and reasons, worst first."""
+    reasons = [reason for test in TESTS for reason in test(facts)]
+    reasons.sort(key=lambda reason: -LEVELS.index(reason.level))
+    return {"level": reasons[0].level if reasons else LEVELS[0], "reasons": [reason.to_dict() for reason in reasons]}
+
+
+def _misfits(facts: Facts) -> Iterator[Reason]:
+    """Sensors whose residuals are larger than their noise. States that left a lag one after the other were never
+    solved together: their misfit says nothing of the data."""
+    for name, value in facts.fit.per_dof().items() if facts.together else ():
+        part = facts.fit.parts.get(name)
+        if part is None or (name in IMAGES and value < EXCLUDED):
+            continue
+        if value > MISFIT and chi_square.sf(part.square, max(part.redundancy, 1.0)) < RARE:
+            level = LEVELS[2] if value > EXCLUDED and part.redundancy > 20 else LEVELS[1]
+            text = f"chi-square per degree of freedom is {value:.1f}, 1 is expected"
+            yield Reason(level, name, text, "check its units, axes, clock and sigmas", value)
+
+
+def _rejected(facts: Facts) -> Iterator[Reason]:
+    for name, residuals in facts.solved.fixes.items():
+        out = ~facts.solved.pass_state.used(name, residuals.rows)
+        if not len(out):
+            continue
+        share = float(out.mean())
+        if share > REJECTED_SHARE:
+            level = LEVELS[2] if share > MOST_REJECTED else LEVELS[1]
+            text = f"{100 * share:.0f} % of the fixes were rejected"
+            yield Reason(level, name, text, "check clock, axes and outliers of this sensor", share)
+        yield from _rejected_runs(facts, name, residuals, out)
+
+
+def _rejected_runs(facts: Facts, name: str, residuals: FixResiduals, out: np.ndarray) -> Iterator[Reason]:
+    t = facts.solved.problem.session.seconds(facts.solved.estimate.t_ns[residuals.keyframe])
+    for first, end in runs(out):
+        last = end - 1
+        if last - first + 1 >= REJECTED_RUN and t[last] - t[first] >= REJECTED_S:
+            size = float(np.linalg.norm(residuals.residual[first:end], axis=1).max())
+            text = f"{end - first} fixes in a row were rejected, up to {size:.1f} m from the solution"
+            remedy = "look whether the fixes or the solution are wrong there"
+            yield Reason(LEVELS[1], name, text, remedy, size, float(t[first]), float(t[last]))
+
+
+def _noise(facts: Facts) -> Iterator[Reason]:
+    imu, pass_state = one_of(facts.solved.problem.builders, ImuBuilder), facts.solved.pass_state
+    if imu is None or not worse_than_class(imu, pass_state):
+        return
+    for name, own in imu.sampling_scales().items():
+        found = pass_state.scale(name)
+        if found > WORSE * max(1.0, WIDEST_OF_SAMPLES * own):
+            text = f"noise of the {name} is found {found:.1f} times that of its class, and its samples do not show it"
+            yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
+
+
+def _clocks(facts: Facts) -> Iterator[Reason]:
+    for name in facts.solved.fixes:
+        offset = facts.solved.estimate.offset_s(name)
+        if abs(offset) > LATE_S:
+            text = f"its clock is found {offset:+.2f} s off, more than a receiver is late"
+            yield Reason(LEVELS[1], name, text, "correct its stamps", offset)
+
+
+def _biases(facts: Facts) -> Iterator[Reason]:
+    noise, bias = facts.solved.problem.calibration.imu_noise, facts.solved.estimate.states()[3]
+    parts = {
+        "accelerometer": (bias[:, :3], noise.accel_bias_sigma, "m/s^2"),
+        "gyro": (bias[:, 3:], noise.gyro_bias_sigma, "rad/s"),
+    }
+    for name, (value, sigma, unit) in parts.items():
+        size = float(np.abs(np.median(value, axis=0)).max())
+        if size > FAR * sigma:
+            text = f"bias of the {name} is found {size:.3g} {unit}, {size / sigma:.0f} times what its class has"
+            yield Reason(LEVELS[1], "imu", text, "check its units, axes and scale, or calibrate the device", size)
+
+
+def _alike(facts: Facts) -> Iterator[Reason]:
+    """Residuals of neighbouring fixes that are alike: an error of the fixes that lasts, or of the solution."""
+    for name, residuals in facts.solved.fixes.items():
+        used = facts.solved.pass_state.used(name, residuals.rows)
+        white = (residuals.residual / residuals.sigma)[used, :2]
+        if len(white) <= LEAST_PAIRS or name in facts.solved.pass_state.correlated:
+            continue
+        rho = float((white[1:] * white[:-1]).sum() / max(float((white**2).sum()), 1e-12))
+        if rho > ALIKE:
+            text = f"residuals of neighbouring fixes have a correlation of {rho:.2f}: their errors last"
+            yield Reason(LEVELS[1], name, text, "give larger sigmas; the covariance is too small", rho)
+
+
+def _predictions(facts: Facts) -> Iterator[Reason]:
+    """Withheld fixes: the solution against interpolation of the kept ones."""
+    session = facts.solved.problem.session
+    for name, held in facts.withheld.items():
+        stream, rows = session.positions().get(name), len(held.t_ns)
+        if stream is None or rows < LEAST_WITHHELD or len(stream) < 2:
+            continue
+        missing = session.nav_position(facts.solved.problem.withheld[name])
+        at = np.searchsorted(facts.solved.problem.withheld[name].t_ns, held.t_ns)
+        line = interpolate(held.t_ns, stream.t_ns, session.nav_position(stream)) - missing[at]
+        ours, theirs = _rms(held.error), _rms(line)
+        if ours > WORSE_THAN_INTERPOLATION * theirs:
+            text = f"withheld fixes are predicted to {ours:.2f} m, to {theirs:.2f} m by a line between the kept ones"
+            yield Reason(LEVELS[1], name, text, "check clock, axes and calibration of the inertial data", ours)
+
+
+def _rms(error: Floats) -> float:
+    return float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
+
+
+def _recording(facts: Facts) -> Iterator[Reason]:
+    """What the recording showed before the graph was built."""
+    t0 = facts.solved.problem.session.t0_ns
+    for finding in facts.solved.problem.findings:
+        level = LEVELS[2] if any(word in finding.text for word in AXES) else LEVELS[1]
+        start, end = (None if t_ns is None else (t_ns - t0) / NS for t_ns in (finding.start_ns, finding.end_ns))
+        yield Reason(level, finding.where, finding.text, finding.remedy, finding.size, start, end)
+
+
+def _solver(facts: Facts) -> Iterator[Reason]:
+    if not facts.solved.estimate.converged:
+        text = "the iteration limit was reached before the cost settled"
+        yield Reason(LEVELS[1], "solve", text, "raise solver.max_iterations")
+
+
+TESTS: tuple[Test, ...] = (_misfits, _rejected, _noise, _clocks, _biases, _alike, _predictions, _recording, _solver)
