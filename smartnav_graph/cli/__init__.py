@@ -1,4 +1,8 @@
-"""The command line: sub-commands, no logic. Exit codes: 0 done, 1 a named error, 2 wrong usage, 130 interrupted."""
+"""The command line: sub-commands, no logic.
+
+Exit codes: 0 done, 1 a named error, 2 wrong usage, 3 done and written but the measurements contradict each other, 130
+interrupted.
+"""
 
 from __future__ import annotations
 
@@ -95,8 +99,7 @@ def _run(name: str, rest: list[str]) -> int:
 
         command = parse(kind, name, rest)
         logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
-        command.run()
-        return 0
+        return command.run() or 0
     except SmartnavError as error:
         if "--debug" in rest:
             traceback.print_exc()

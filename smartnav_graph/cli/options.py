@@ -39,8 +39,8 @@ class Command:
         """Defaults that depend on the arguments; None for those of the class."""
         return None
 
-    def run(self) -> None:
-        """Execute the command."""
+    def run(self) -> int | None:
+        """Execute the command; the exit code, where it is not 0."""
         raise NotImplementedError
 
 

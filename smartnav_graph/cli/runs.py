@@ -24,6 +24,9 @@ from smartnav_graph.output.run_folder import StoredRun, check_out, read_run, wri
 from smartnav_graph.output.summary_json import table_of, text_of
 from smartnav_graph.session.calibration import model as calibration_model
 
+# Exit code of a run that is finished and written, and whose measurements exclude each other.
+CONTRADICTORY = 3
+
 
 @dataclass(frozen=True, kw_only=True)
 class Smooth(Estimating):
@@ -32,8 +35,8 @@ class Smooth(Estimating):
     Example: smartnav smooth kitti --out kitti-run --withhold gnss:every=10
     """
 
-    def run(self) -> None:
-        estimate_to_folder(self, self.resolved(), causal=False)
+    def run(self) -> int:
+        return estimate_to_folder(self, self.resolved(), causal=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +59,12 @@ class Replay(Estimating):
         config = super().resolved()
         return replace(config, replay=replace(config.replay, **given(smoother=self.smoother, lag_s=self.lag)))
 
-    def run(self) -> None:
-        estimate_to_folder(self, self.resolved(), causal=True)
+    def run(self) -> int:
+        return estimate_to_folder(self, self.resolved(), causal=True)
 
 
-def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> None:
-    """Load, estimate, write, print."""
+def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> int:
+    """Load, estimate, write, print; the exit code."""
     check_out(command.out, command.force)
     with progress(command.quiet) as show:
         show(f"reading {command.session}", 0, 0)
@@ -74,6 +77,7 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
     if "interrupted" in text_of(summary, "mode") and not command.quiet:
         print("smartnav: interrupted; the part that was done is written", file=sys.stderr)
     print_findings(run_text(summary, command.out))
+    return CONTRADICTORY if text_of(table_of(summary, "verdict"), "level") == "contradictory" else 0
 
 
 def against_own_reference(run: Run) -> Evaluation | None:

@@ -8,10 +8,24 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from smartnav_graph.output.summary_json import Summary, imu_gaps, list_of, numbers_of, table_of, text_of
+from smartnav_graph.output.summary_json import (
+    Summary,
+    imu_gaps,
+    list_of,
+    numbers_of,
+    table_of,
+    text_of,
+    verdict_lines,
+)
 from smartnav_graph.session.session import Session
 
-STYLES = {"error:": "bold red", "warning:": "yellow", "missing:": "cyan"}
+STYLES = {
+    "contradictory:": "bold red",
+    "doubtful:": "yellow",
+    "error:": "bold red",
+    "warning:": "yellow",
+    "missing:": "cyan",
+}
 
 
 def print_findings(text: str) -> None:
@@ -38,6 +52,7 @@ def run_text(summary: Summary, out: Path) -> str:
     """The result of a run in a few lines."""
     timings, chi2 = numbers_of(summary, "timings_s"), numbers_of(summary, "chi2_per_dof")
     lines = [
+        *verdict_lines(summary),
         f"{summary['mode']}: {summary['duration_s']:.1f} s, path {summary['path_m']:.1f} m, "
         f"{summary['keyframes']} keyframes, in {timings['total']:.1f} s",
         f"start: {text_of(table_of(summary, 'initialisation'), 'sentence')}",

@@ -74,6 +74,17 @@ def standstill_spans(summary: Summary) -> list[tuple[float, float]]:
     return [(start, end) for start, end in spans.tolist()]
 
 
+def verdict_lines(summary: Summary) -> list[str]:
+    """The verdict and its reasons."""
+    found = table_of(summary, "verdict")
+    lines = [f"verdict: {text_of(found, 'level')}"] if found else []
+    for reason in rows_of(found, "reasons"):
+        start, end = (as_float(reason.get(name)) for name in ("start_s", "end_s"))
+        when = "" if start is None else f" from {start:.1f} s" + ("" if end is None else f" to {end:.1f} s")
+        lines.append(f"{reason['level']}: {reason['sensor']}{when}: {reason['text']}; {reason['remedy']}")
+    return lines
+
+
 def plain(value: object) -> object:
     """Plain JSON types: no NumPy scalar, and null for what is not finite."""
     if isinstance(value, Mapping):

@@ -2,8 +2,8 @@
 
 Its tests are none that the estimate made itself: every sensor's chi-square by its own redundancy, how far the noise,
 clock and biases found lie from what was known of them before, which fixes were rejected, whether residuals of
-neighbouring fixes are alike, withheld fixes against interpolation of the kept ones, and what the recording showed before
-the graph was built.
+neighbouring fixes are alike, withheld fixes against interpolation of the kept ones, and what the recording showed
+before the graph was built.
 
 contradictory : measurements exclude each other, or the result is no trajectory of this device
 doubtful : the result may be wrong by more than its covariance says
@@ -23,13 +23,16 @@ from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
 from smartnav_graph.estimate.reweight.imu_noise import WIDEST_OF_SAMPLES, WORSE, worse_than_class
-from smartnav_graph.estimate.reweight.outliers import FixResiduals
+from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
+from smartnav_graph.factors.gnss import LEAST_CORRELATED_SIGMA
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
 
 LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
 MISFIT, EXCLUDED = 2.0, 6.0
+# Sensors under a redescending loss: their tails are expected.
+ROBUST = (*IMAGES, "magnetometer")
 # How rarely a sensor that fits reaches its chi-square.
 RARE = 1e-6
 # Consecutive rejected fixes, seconds of them, and share of all, that speak against the solution rather than the fixes.
@@ -44,6 +47,8 @@ ALIKE, LEAST_PAIRS = 0.35, 40
 WORSE_THAN_INTERPOLATION, LEAST_INSIDE, LEAST_WITHHELD = 1.1, 0.8, 20
 # Findings on the recording that put its geometry in doubt.
 AXES = ("axes", "axis", "turns against", "mirrored", "swapped", "north, east, down", "opposite", "left-handed")
+# Findings that the estimate takes account of.
+HARMLESS = ("data gap", "outside the imu's span", "no sigma", "no absolute sensor", "too low to follow")
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ def _misfits(facts: Facts) -> Iterator[Reason]:
     solved together: their misfit says nothing of the data."""
     for name, value in facts.fit.per_dof().items() if facts.together else ():
         part = facts.fit.parts.get(name)
-        if part is None or (name in IMAGES and value < EXCLUDED):
+        if part is None or (name in ROBUST and value < EXCLUDED):
             continue
         if value > MISFIT and chi_square.sf(part.square, max(part.redundancy, 1.0)) < RARE:
             level = LEVELS[2] if value > EXCLUDED and part.redundancy > 20 else LEVELS[1]
@@ -130,6 +135,17 @@ def _noise(facts: Facts) -> Iterator[Reason]:
         if found > WORSE * max(1.0, WIDEST_OF_SAMPLES * own):
             text = f"noise of the {name} is found {found:.1f} times that of its class, and its samples do not show it"
             yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
+
+
+def _filtered(facts: Facts) -> Iterator[Reason]:
+    """Fixes without sigmas that agree with each other, but with the inertial data only by a correlated error."""
+    for builder in position_builders(facts.solved.problem.builders):
+        sigma = float(np.median(builder.scaled_sigma(facts.solved.pass_state)[:, :2]))
+        if builder.name in facts.solved.pass_state.correlated and sigma < LEAST_CORRELATED_SIGMA:
+            text = f"fixes agree with each other to {sigma:.2f} m, but not so with the inertial data"
+            remedy = "they may be filtered, or a lever arm, scale or height wrong; give sigmas where they are right"
+
+            yield Reason(LEVELS[1], builder.name, text, remedy, sigma)
 
 
 def _clocks(facts: Facts) -> Iterator[Reason]:
@@ -190,6 +206,8 @@ def _recording(facts: Facts) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
     t0 = facts.solved.problem.session.t0_ns
     for finding in facts.solved.problem.findings:
+        if any(word in finding.text for word in HARMLESS):
+            continue
         level = LEVELS[2] if any(word in finding.text for word in AXES) else LEVELS[1]
         start, end = (None if t_ns is None else (t_ns - t0) / NS for t_ns in (finding.start_ns, finding.end_ns))
         yield Reason(level, finding.where, finding.text, finding.remedy, finding.size, start, end)
@@ -201,4 +219,6 @@ def _solver(facts: Facts) -> Iterator[Reason]:
         yield Reason(LEVELS[1], "solve", text, "raise solver.max_iterations")
 
 
-TESTS: tuple[Test, ...] = (_misfits, _rejected, _noise, _clocks, _biases, _alike, _predictions, _recording, _solver)
+TESTS: tuple[Test, ...] = (
+    *(_misfits, _rejected, _noise, _filtered, _clocks, _biases, _alike, _predictions, _recording, _solver),
+)

@@ -21,7 +21,7 @@ from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report import facts, reference, session_states, usage
 from smartnav_graph.output.report.charts import Scored
 from smartnav_graph.output.report.sections import page
-from smartnav_graph.output.summary_json import Summary, imu_gaps
+from smartnav_graph.output.summary_json import Summary, imu_gaps, verdict_lines
 from smartnav_graph.session.session import Session
 
 __all__ = ["report_markdown", "write_report"]
@@ -64,6 +64,8 @@ def write_report(
 def report_markdown(summary: Summary, evaluation: Evaluation | None = None) -> str:
     """The headline, warnings and tables of the report as Markdown."""
     parts = ["# Run report", " ".join(facts.headline(summary))]
+    if lines := verdict_lines(summary):
+        parts += ["## Verdict", "\n".join(f"- {line}" for line in lines)]
     warnings = facts.warnings(summary)
     if warnings:
         parts += ["## Warnings", "\n".join(f"- **{what}** {remedy}".rstrip() for what, remedy in warnings)]

@@ -23,7 +23,7 @@ from smartnav_graph.output.report import (
     track,
     usage,
 )
-from smartnav_graph.output.summary_json import ImuGap, Summary, imu_gaps, numbers_of
+from smartnav_graph.output.summary_json import ImuGap, Summary, imu_gaps, numbers_of, verdict_lines
 from smartnav_graph.output.text import Table, attributes, fixed, metres, plural
 from smartnav_graph.session.session import Session
 
@@ -59,6 +59,7 @@ def page(
     gaps = imu_gaps(summary)
     shaded = [(start, start + length) for start, length, _ in gaps]
     parts = [
+        verdict_section(summary),
         warnings_section(solution, summary),
         section("map", "Trajectory", track.draw(session, solution, gaps, causal_solution)),
         section("timeline", "Timeline", timeline.draw(solution, summary, shaded, scored)),
@@ -124,6 +125,17 @@ def sigma_sentence(solution: Solution) -> str:
         '<p class="fine">Horizontal: √(σ<sub>e</sub>² + σ<sub>n</sub>²), as for the errors below. '
         "Seconds count from the first IMU sample.</p>"
     )
+
+
+def verdict_section(summary: Summary) -> str:
+    """Whether the run can be trusted, and why not."""
+    if not verdict_lines(summary):
+        return ""
+    level, *reasons = verdict_lines(summary)
+    text = f'<p class="calm"><strong>{escape(level.capitalize())}</strong></p>'
+    items = "".join(f"<li><strong>{escape(line)}</strong></li>" for line in reasons)
+    shown = text + (f'<ul class="warnings">{items}</ul>' if items else "")
+    return section("verdict", "Verdict", shown, {"level": level.removeprefix("verdict: "), "count": len(reasons)})
 
 
 def warnings_section(solution: Solution, summary: Summary) -> str:

@@ -42,7 +42,7 @@ from smartnav_graph.session.session import Session
 __all__ = ["view", "write_latency", "write_recording"]
 
 # Parts of a summary that a recording shows; timings and memory differ from run to run.
-_SHOWN = ("gaps", "initialisation", "warnings", "standstills", "states")
+_SHOWN = ("verdict", "gaps", "initialisation", "warnings", "standstills", "states")
 # Wall times of updates differ from run to run, too.
 _STEADY = [name for name in Updates.__dataclass_fields__ if name != "latency_ms"]
 
@@ -103,7 +103,8 @@ def write_recording(
     path : the file; replaced only when the new one is complete
     session : the recorded session; alone is enough
     solution : the smoothed solution, if there is one
-    summary : as in summary.json; its `gaps`, `standstills`, `states`, `initialisation` and `warnings` are shown
+    summary : as in summary.json; its `verdict`, `gaps`, `standstills`, `states`, `initialisation` and `warnings` are
+    shown
     evaluation : comparison with a reference
     causal : the causal states of a replay
     diagnostics : factor graph, image pairs and updates of the run

@@ -8,7 +8,7 @@ import rerun as rr
 from smartnav_graph.core.timebase import Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.output.rerun_log.recorder import Recorder
-from smartnav_graph.output.summary_json import Summary, list_of, table_of, text_of
+from smartnav_graph.output.summary_json import Summary, list_of, table_of, text_of, verdict_lines
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
@@ -79,7 +79,10 @@ def log_lines(recorder: Recorder, session: Session, events: Events, summary: Sum
 
 def _first_lines(session: Session, events: Events, summary: Summary, notes: list[str]) -> list[Line]:
     start = events.start_ns
-    lines = [
+    found = table_of(summary, "verdict")
+    level = "INFO" if text_of(found, "level") == "good" else "WARN"
+    lines = [(start, level, line) for line in verdict_lines(summary)]
+    lines += [
         (start, "INFO", f"{name}: {len(stream)} rows{_rate(stream)}") for name, stream in session.streams().items()
     ]
     for stream, counts in session.dropped.items():

@@ -1,0 +1,73 @@
+"""The verdict: good on clean recordings, and not where something is wrong, with the right reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import smartnav_graph as sn
+from smartnav_graph.simulation.degrade import Degrade, degrade
+
+NS = 10**9
+
+
+def inertial(session, change):
+    gyro, accel = change(session.imu.gyro, session.imu.accel)
+    return session.replace(imu=replace(session.imu, gyro=gyro, accel=accel))
+
+
+def moved(session, shift):
+    enu = session.nav_position(session.gnss) + shift
+    return session.replace(gnss=replace(session.gnss, lla=None, enu=enu))
+
+
+@pytest.fixture(scope="module")
+def drive(kitti):
+    """Two minutes of a drive."""
+    cut = kitti.t0_ns + 130 * NS
+    imu, gnss = kitti.imu, kitti.gnss
+    return kitti.replace(imu=imu.take(imu.t_ns < cut), gnss=gnss.take(gnss.t_ns < cut))
+
+
+def verdict(session) -> tuple[str, str]:
+    found = sn.run(session).summary["verdict"]
+    for reason in found["reasons"]:
+        assert set(reason) == {"level", "sensor", "text", "remedy", "size", "start_s", "end_s"}
+        assert reason["text"] and reason["remedy"]
+    return found["level"], " | ".join(f"{reason['sensor']}: {reason['text']}" for reason in found["reasons"])
+
+
+@pytest.mark.parametrize("scenario", ["car-10min", "figure-eight-60s", "trolley-loop", "walk-60s"])
+def test_clean_simulations_are_good(scenario):
+    assert verdict(sn.simulate(scenario, seed=3)) == ("good", "")
+
+
+def test_a_clean_drive_is_good(drive):
+    assert verdict(drive) == ("good", "")
+    assert verdict(degrade(drive, Degrade(gnss_white=3.0, gnss_gm=(4.0, 60.0)), 1))[0] == "good"
+
+
+FAULTS = {
+    "gyro sign": (lambda s: inertial(s, lambda g, a: (-g, a)), "contradictory", "gyro"),
+    "axes exchanged": (lambda s: inertial(s, lambda g, a: (g[:, [1, 0, 2]], a[:, [1, 0, 2]])), "contradictory", "imu"),
+    "reversed fixes": (lambda s: moved(s, s.nav_position(s.gnss)[::-1] - s.nav_position(s.gnss)), None, ""),
+    "18 s late": (
+        lambda s: s.replace(gnss=replace(s.gnss, t_ns=s.gnss.t_ns + 18 * NS).take(slice(0, -18))),
+        "doubtful",
+        "GPS time against UTC",
+    ),
+    "a multipath stretch": (
+        lambda s: moved(s, np.where(np.arange(len(s.gnss))[:, None] // 25 == 2, 130.0, 0.0) * [1.0, 0.0, 0.0]),
+        None,
+        "in a row were rejected",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_not_good(drive, fault):
+    change, level, word = FAULTS[fault]
+    found, text = verdict(change(drive))
+    assert found != "good" and (level is None or found == level) and word in text, text
