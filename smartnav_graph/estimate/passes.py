@@ -15,7 +15,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
+import numpy as np
 
+from smartnav_graph.core.errors import SolverError
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs, images_diverged
@@ -71,6 +73,13 @@ def run_pass(
     except KeyboardInterrupt:
         if not interruptible:
             raise
+    except np.linalg.LinAlgError as error:
+        raise SolverError(
+            "solve",
+            f"no trajectory of a device agrees with the measurements ({error})",
+            "fixes and inertial data of one motion",
+            "look for jumps of the fixes, and for units and axes, with `smartnav info`",
+        ) from error
     for builder in builders:
         pass_state = builder.end(pass_state)
     return pass_state
@@ -136,6 +145,8 @@ def next_pass(
     )
     if pass_.coarse_start:
         return following
+    if updated.trusted != state.trusted:  # not the fixes were wrong, but the solution
+        return replace(following, initial_values=pass_.first_values, limit=pass_.limit + RESTART_PASSES)
     # Least squares bent by outliers is a poor start for a redescending loss. Predicted and solved segment by segment,
     # the trajectory stays near the truth and a burst of outliers is obvious. Where that diverges: least squares again.
     if state.phase is Phase.ROBUST and not (estimate.converged or pass_.restarted):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
@@ -28,7 +28,7 @@ from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import GnssNoise
-from smartnav_graph.session.detect.scatter import Scatter, scatter
+from smartnav_graph.session.detect.scatter import Scatter, agrees_with_neighbours, scatter
 from smartnav_graph.session.stream import Positioned
 
 LEAST_CORRELATED_SIGMA = 0.5  # m
@@ -112,7 +112,8 @@ class PositionBuilder(Builder):
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
-    first. `scatter` of the fixes by themselves, horizontal and vertical. Rows are tested with `least_gate_sigma` m at
+    first. `scatter` of the fixes by themselves, horizontal and vertical,
+    and which `agrees` (n,) with its neighbours. Rows are tested with `least_gate_sigma` m at
     least when outliers are looked for.
     """
 
@@ -127,6 +128,7 @@ class PositionBuilder(Builder):
     least_gate_sigma: float = 0.0
     typical: NDArray[np.bool_] | slice = field(default_factory=lambda: slice(None))
     scatter: tuple[Scatter | None, Scatter | None] = (None, None)
+    agrees: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
     stage: int = 0
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
@@ -151,8 +153,21 @@ class PositionBuilder(Builder):
             first = max(session.t0_ns + round(INITIALISATION_S * NS), int(stream.available_ns.min()))
             typical = stream.available_ns <= first
         t_ns, known = stream.t_ns[typical], position[typical]
+        agrees = agrees_with_neighbours(stream.t_ns, position[:, :2])
         parts = scatter(t_ns, known[:, :2]), scatter(t_ns, known[:, 2:])
-        return cls(name, position, sigma, own, lever, config, noise, session.gravity, typical=typical, scatter=parts)
+        return cls(
+            name,
+            position,
+            sigma,
+            own,
+            lever,
+            config,
+            noise,
+            session.gravity,
+            typical=typical,
+            scatter=parts,
+            agrees=agrees,
+        )
 
     def has_correlated_error(self, pass_state: PassState, *, doubtful: bool = False) -> bool:
         """Whether these fixes are of a code receiver: by the device's noise, unless they are better than

@@ -48,6 +48,7 @@ class PassState:
     selections : what a builder of images selected of its measurements, by its name
     outlier_tests : how often image pairs and tracks were tested against a solution, by builder
     weights, gnc_mu : weights of rows between 0 and 1 by sensor, and the control parameter mu of GNC
+    trusted : rows of fixes that outlier tests may no longer reject, by sensor
     robust_floor_m : least sigma (m) of a fix under the redescending loss
     refuted : first stamp of the standstills in which the solution moves
     """
@@ -64,6 +65,7 @@ class PassState:
     weights: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     gnc_mu: float = 0.0
     robust_floor_m: float = 0.0
+    trusted: Mapping[str, frozenset[int]] = field(default_factory=dict)
     refuted: frozenset[int] = frozenset()
 
     def weight(self, sensor: str, row: int) -> float:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2 as chi_square
@@ -64,7 +63,7 @@ class Reason:
     start_s: float | None = None
     end_s: float | None = None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """As in summary.json."""
         return {name: round(value, 4) if isinstance(value, float) else value for name, value in vars(self).items()}
 
@@ -82,7 +81,7 @@ class Facts:
 Test = Callable[[Facts], Iterator[Reason]]
 
 
-def verdict(facts: Facts) -> dict[str, Any]:
+def verdict(facts: Facts) -> dict[str, object]:
     """The verdict as in summary.json: level, and reasons, worst first."""
     reasons = [reason for test in TESTS for reason in test(facts)]
     reasons.sort(key=lambda reason: -LEVELS.index(reason.level))

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from smartnav_graph.core.arrays import runs
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
@@ -49,6 +50,8 @@ LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
 # What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
 PRIOR_FIXES = 30.0
+# Share of rejected fixes above which the solution is suspect.
+SUSPECT_SHARE = 0.1
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
@@ -94,11 +97,16 @@ def _update_noise_and_fixes(
     for builder, residuals in found.values():
         new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
-    if pass_state.phase is Phase.PLAIN and any(v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested):
+    worst = {v.name: v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested}
+    if pass_state.phase is Phase.PLAIN and any(worst.values()) and not pass_state.trusted:
         return replace(new, phase=Phase.ROBUST), False
     if pass_state.narrowing:
         return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
-    outliers = {v.name: v.outside() for v in tested}
+    outliers = {v.name: v.outside() - pass_state.trusted.get(v.name, frozenset()) for v in tested}
+    trusted = {name: suspects(builder, outliers.get(name, frozenset())) for name, (builder, _) in found.items()}
+    if any(trusted.values()):  # least squares again, with them
+        trusted = {name: rows | pass_state.trusted.get(name, frozenset()) for name, rows in trusted.items()}
+        return replace(new, phase=Phase.PLAIN, rejected={}, weights={}, trusted=trusted, noise_scales={}), False
     if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
         weighed = _next_gnc(tested, pass_state)
         if weighed is not None:
@@ -114,6 +122,21 @@ def _update_noise_and_fixes(
         return new, False
     grown = enable_second_stage(builders, estimate, new)
     return grown, grown == new
+
+
+def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[int]:
+    """Rejected fixes that agree with their neighbours, where a large share is rejected: not they are suspect, but the
+    solution. A run of rejected fixes must agree with those before and after it too: a burst of outliers does not."""
+    n = len(builder.agrees)
+    if len(rejected) <= SUSPECT_SHARE * n:
+        return frozenset()
+    out = np.isin(np.arange(n), list(rejected))
+    found = [
+        range(first, end)
+        for first, end in runs(out)
+        if builder.agrees[[*range(max(first - 1, 2), first + 1), *range(end - 1, min(end, n - 3) + 1)]].all()
+    ]
+    return frozenset(row for run in found for row in run)
 
 
 def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float) -> PassState:

@@ -21,11 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
 
 LEAST_FIXES = 12
+# Share of good fixes that agree with their neighbours.
+AGREES = 0.999
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
 # and longest median spacing.
 NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
@@ -74,6 +76,18 @@ def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatte
     sigma, sign = _sigma(near), float(np.nanmean(np.sign(near[1:] * near[:-1])))
     close = float(np.median(np.diff(t_ns))) / NS < NOISE_SPACING_S
     return Scatter(sigma, close and sign < NOISE_SIGN and _sigma(far) < NOISE_GROWTH * sigma, len(t_ns))
+
+
+def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
+    """Which fixes (n,) lie no farther from the cubic through their neighbours than the scatter of all allows; the first
+    and last two, and repeated stamps, agree with nothing."""
+    out = np.zeros(len(t_ns), dtype=bool)
+    first = np.flatnonzero(np.concatenate([[True], np.diff(t_ns) > 0])[: len(t_ns)])
+    if len(first) >= LEAST_FIXES:
+        residual = normalised_residuals(t_ns[first], position[first])
+        limit = chi2(position.shape[1]).ppf(AGREES) * max(_sigma(residual), 1e-9) ** 2
+        out[first] = np.nan_to_num((residual**2).sum(axis=1), nan=np.inf) < limit
+    return out
 
 
 def _sigma(residual: Floats) -> float:

@@ -16,8 +16,9 @@ from smartnav_graph.session.health.axes import axes_finding
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 
-# Lags below are of the receiver and its filter, and are estimated as a state.
-STATE_S = 1.5
+# Lags below are of the receiver and its filter. Their state is linear about zero: known lags beyond the second are
+# taken from the stamps before.
+STATE_S, LINEAR_S = 1.5, 0.3
 _GPS_EPOCH_S = 315_964_800.0
 _SENSORS = ("gnss", "pose_fixes")
 
@@ -80,13 +81,13 @@ def beyond_state(offset: ClockOffset) -> bool:
 
 
 def apply_offsets(session: Session, report: ClockReport) -> tuple[Session, ClockReport]:
-    """Stamps without the offsets that exceed what is estimated as a state, and the report that says so.
+    """Stamps without the offsets that are too large for a state alone, and the report that says so.
 
     The arrival of rows shifts with them: it is of the same clock.
     """
     changes, offsets = {}, []
     for offset in report.offsets:
-        if beyond_state(offset):
+        if offset.known and abs(offset.lag_s) > max(LINEAR_S, 3.0 * offset.sigma_s):
             stream = session.positions()[offset.sensor]
             shift = round(offset.lag_s * NS)
             arrival = None if stream.arrival_ns is None else stream.arrival_ns - shift

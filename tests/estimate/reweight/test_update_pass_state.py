@@ -13,7 +13,7 @@ from smartnav_graph.estimate.passes import solve_passes
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.estimate.reweight.imu_noise import RELAXATION
 from smartnav_graph.estimate.reweight.outliers import fix_residuals
-from smartnav_graph.estimate.reweight.update import LEAST_SIGMA, update_pass_state
+from smartnav_graph.estimate.reweight.update import LEAST_SIGMA, suspects, update_pass_state
 from smartnav_graph.estimate.run import initialise
 from smartnav_graph.factors.gnss import GnssConfig
 from smartnav_graph.factors.imu import ImuConfig
@@ -262,3 +262,14 @@ def test_without_positions_there_is_nothing_to_learn(drive):
     inertial = graph.builders["imu"]
     inertial.config = ImuConfig(estimate_noise=False)
     assert update_pass_state([inertial], graph.windows, estimate_of(graph), PassState()) == (PassState(), True)
+
+
+def test_many_rejected_fixes_that_agree_with_their_neighbours_make_the_solution_suspect(drive):
+    (builder,), _, _ = at_truth(drive, with_fixes(drive, [1.0] * 3))
+    n = len(builder.position)
+    builder.agrees = np.ones(n, dtype=bool)
+    assert suspects(builder, frozenset(range(40, 40 + n // 20))) == frozenset()  # few: outliers
+    many = frozenset(range(40, 40 + n // 5))
+    assert suspects(builder, many) == many
+    builder.agrees[[39, 40]] = False  # a step into the run: a burst of outliers
+    assert suspects(builder, many) == frozenset()

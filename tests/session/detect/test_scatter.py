@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.session.detect.scatter import LEAST_FIXES, normalised_residuals, scatter
+from smartnav_graph.session.detect.scatter import LEAST_FIXES, agrees_with_neighbours, normalised_residuals, scatter
 
 NS = 10**9
 
@@ -66,3 +66,13 @@ def test_repeated_and_few_fixes() -> None:
     assert once is not None and twice is not None and once.rows == twice.rows == 50
     assert scatter(stamps(LEAST_FIXES - 1), position[: LEAST_FIXES - 1]) is None
     assert scatter(stamps(0), np.zeros((0, 2))) is None
+
+
+def test_fixes_off_their_neighbours_do_not_agree_with_them() -> None:
+    rng = np.random.default_rng(6)
+    position = 10.0 * np.arange(100.0)[:, None] + rng.normal(0.0, 1.0, (100, 2))
+    position[40] += 50.0
+    position[60:80] += 100.0
+    agrees = agrees_with_neighbours(stamps(100), position)
+    assert not agrees[[0, 1, 40, 59, 60, 79, 80, 98, 99]].any()
+    assert agrees[[10, 30, 50, 65, 70, 75, 90]].mean() > 0.8
