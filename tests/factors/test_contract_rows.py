@@ -442,7 +442,7 @@ def test_a_measurement_that_is_no_number_is_refused_by_name(sensor, value):
     name, column = CASES[sensor].stream
     stream = getattr(CASES[sensor].record(None).session, name)
     rows = np.array(getattr(stream, column))
-    rows.reshape(len(rows), -1)[4, -1] = value
+    rows.reshape(len(rows), -1)[4, 0] = value
     with pytest.raises(SessionError, match=rf"^{name}: \w+ is {value} at row 4 .*; expected finite numbers") as error:
         replace(stream, **{column: rows})
     assert error.value.stream == name and error.value.row == 4

@@ -37,10 +37,11 @@ def test_an_offset_is_named_and_corrected(drive, shift_s: float, name: str) -> N
 
 
 @pytest.mark.parametrize("shift_s", [0.0, 0.8, -0.8])
-def test_the_lag_of_a_receiver_is_left_to_its_state(drive, shift_s: float) -> None:
+def test_the_lag_of_a_receiver_is_no_finding_and_small_enough_for_its_state(drive, shift_s: float) -> None:
     session, report = apply_offsets(shifted(drive, shift_s), compare_clocks(shifted(drive, shift_s)))
-    assert report.offsets[0].known and not report.offsets[0].applied and not report.findings
-    assert (session.gnss.t_ns == shifted(drive, shift_s).gnss.t_ns).all()
+    assert report.offsets[0].known and not report.findings
+    assert report.offsets[0].applied == (shift_s != 0.0)
+    assert np.abs(session.gnss.t_ns - drive.gnss.t_ns).max() < 0.2e9
 
 
 def test_a_session_without_fixes_or_inertial_data(drive) -> None:

@@ -50,8 +50,8 @@ LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
 # What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
 PRIOR_FIXES = 30.0
-# Share of rejected fixes above which the solution is suspect.
-SUSPECT_SHARE = 0.1
+# Share and number of rejected fixes above which the solution is suspect.
+SUSPECT_SHARE, LEAST_SUSPECTS = 0.1, 10
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
@@ -128,7 +128,7 @@ def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[in
     """Rejected fixes that agree with their neighbours, where a large share is rejected: not they are suspect, but the
     solution. A run of rejected fixes must agree with those before and after it too: a burst of outliers does not."""
     n = len(builder.agrees)
-    if len(rejected) <= SUSPECT_SHARE * n:
+    if len(rejected) <= max(SUSPECT_SHARE * n, LEAST_SUSPECTS):
         return frozenset()
     out = np.isin(np.arange(n), list(rejected))
     found = [

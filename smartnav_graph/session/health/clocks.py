@@ -16,9 +16,10 @@ from smartnav_graph.session.health.axes import axes_finding
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 
-# Lags below are of the receiver and its filter. Their state is linear about zero: known lags beyond the second are
-# taken from the stamps before.
+# Lags below are of the receiver and its filter, and are estimated as a state. That is linear about zero: lags beyond
+# the second are taken from the stamps before, where they are known this well (s) and this sharply.
 STATE_S, LINEAR_S = 1.5, 0.3
+_PRECISE_S, _SHARP = 0.06, 100.0
 _GPS_EPOCH_S = 315_964_800.0
 _SENSORS = ("gnss", "pose_fixes")
 
@@ -87,7 +88,8 @@ def apply_offsets(session: Session, report: ClockReport) -> tuple[Session, Clock
     """
     changes, offsets = {}, []
     for offset in report.offsets:
-        if offset.known and abs(offset.lag_s) > max(LINEAR_S, 3.0 * offset.sigma_s):
+        precise = offset.sigma_s < _PRECISE_S and offset.sharpness > _SHARP
+        if beyond_state(offset) or (offset.known and precise and abs(offset.lag_s) > LINEAR_S):
             stream = session.positions()[offset.sensor]
             shift = round(offset.lag_s * NS)
             arrival = None if stream.arrival_ns is None else stream.arrival_ns - shift
