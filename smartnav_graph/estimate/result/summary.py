@@ -17,7 +17,7 @@ from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld, used_counts
 from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
-from smartnav_graph.estimate.result.verdict import Facts, verdict
+from smartnav_graph.estimate.result.verdict import VerdictInputs, verdict
 from smartnav_graph.estimate.reweight.false_standstills import refuted_text
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
@@ -92,7 +92,7 @@ def summarise(
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
     summary: dict[str, Any] = {
-        "verdict": verdict(Facts(solved, fit, withheld, together)),
+        "verdict": verdict(VerdictInputs(solved, fit, withheld, together)),
         "mode": mode,
         "vehicle": problem.vehicle,
         "session": _session(problem.session),

@@ -69,7 +69,7 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class Facts:
+class VerdictInputs:
     """What the tests look at."""
 
     solved: SolvedProblem
@@ -78,21 +78,21 @@ class Facts:
     together: bool
 
 
-Test = Callable[[Facts], Iterator[Reason]]
+Test = Callable[[VerdictInputs], Iterator[Reason]]
 
 
-def verdict(facts: Facts) -> dict[str, object]:
+def verdict(inputs: VerdictInputs) -> dict[str, object]:
     """The verdict as in summary.json: level, and reasons, worst first."""
-    reasons = [reason for test in TESTS for reason in test(facts)]
+    reasons = [reason for test in TESTS for reason in test(inputs)]
     reasons.sort(key=lambda reason: -LEVELS.index(reason.level))
     return {"level": reasons[0].level if reasons else LEVELS[0], "reasons": [reason.to_dict() for reason in reasons]}
 
 
-def _misfits(facts: Facts) -> Iterator[Reason]:
+def _misfits(inputs: VerdictInputs) -> Iterator[Reason]:
     """Sensors whose residuals are larger than their noise. States that left a lag one after the other were never
     solved together: their misfit says nothing of the data."""
-    for name, value in facts.fit.per_dof().items() if facts.together else ():
-        part = facts.fit.parts.get(name)
+    for name, value in inputs.fit.per_dof().items() if inputs.together else ():
+        part = inputs.fit.parts.get(name)
         if part is None or (name in ROBUST and value < EXCLUDED):
             continue
         if value > MISFIT and chi_square.sf(part.square, max(part.redundancy, 1.0)) < RARE:
@@ -101,9 +101,9 @@ def _misfits(facts: Facts) -> Iterator[Reason]:
             yield Reason(level, name, text, "check its units, axes, clock and sigmas", value)
 
 
-def _rejected(facts: Facts) -> Iterator[Reason]:
-    for name, residuals in facts.solved.fixes.items():
-        out = ~facts.solved.pass_state.used(name, residuals.rows)
+def _rejected(inputs: VerdictInputs) -> Iterator[Reason]:
+    for name, residuals in inputs.solved.fixes.items():
+        out = ~inputs.solved.pass_state.used(name, residuals.rows)
         if not len(out):
             continue
         share = float(out.mean())
@@ -111,11 +111,11 @@ def _rejected(facts: Facts) -> Iterator[Reason]:
             level = LEVELS[2] if share > MOST_REJECTED else LEVELS[1]
             text = f"{100 * share:.0f} % of the fixes were rejected"
             yield Reason(level, name, text, "check clock, axes and outliers of this sensor", share)
-        yield from _rejected_runs(facts, name, residuals, out)
+        yield from _rejected_runs(inputs, name, residuals, out)
 
 
-def _rejected_runs(facts: Facts, name: str, residuals: FixResiduals, out: np.ndarray) -> Iterator[Reason]:
-    t = facts.solved.problem.session.seconds(facts.solved.estimate.t_ns[residuals.keyframe])
+def _rejected_runs(inputs: VerdictInputs, name: str, residuals: FixResiduals, out: np.ndarray) -> Iterator[Reason]:
+    t = inputs.solved.problem.session.seconds(inputs.solved.estimate.t_ns[residuals.keyframe])
     for first, end in runs(out):
         last = end - 1
         if last - first + 1 >= REJECTED_RUN and t[last] - t[first] >= REJECTED_S:
@@ -125,8 +125,8 @@ def _rejected_runs(facts: Facts, name: str, residuals: FixResiduals, out: np.nda
             yield Reason(LEVELS[1], name, text, remedy, size, float(t[first]), float(t[last]))
 
 
-def _noise(facts: Facts) -> Iterator[Reason]:
-    imu, pass_state = one_of(facts.solved.problem.builders, ImuBuilder), facts.solved.pass_state
+def _noise(inputs: VerdictInputs) -> Iterator[Reason]:
+    imu, pass_state = one_of(inputs.solved.problem.builders, ImuBuilder), inputs.solved.pass_state
     if imu is None or not worse_than_class(imu, pass_state):
         return
     for name, own in imu.sampling_scales().items():
@@ -136,27 +136,27 @@ def _noise(facts: Facts) -> Iterator[Reason]:
             yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
 
 
-def _filtered(facts: Facts) -> Iterator[Reason]:
+def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
     """Fixes without sigmas that agree with each other, but with the inertial data only by a correlated error."""
-    for builder in position_builders(facts.solved.problem.builders):
-        sigma = float(np.median(builder.scaled_sigma(facts.solved.pass_state)[:, :2]))
-        if builder.name in facts.solved.pass_state.correlated and sigma < LEAST_CORRELATED_SIGMA:
+    for builder in position_builders(inputs.solved.problem.builders):
+        sigma = float(np.median(builder.scaled_sigma(inputs.solved.pass_state)[:, :2]))
+        if builder.name in inputs.solved.pass_state.correlated and sigma < LEAST_CORRELATED_SIGMA:
             text = f"fixes agree with each other to {sigma:.2f} m, but not so with the inertial data"
             remedy = "they may be filtered, or a lever arm, scale or height wrong; give sigmas where they are right"
 
             yield Reason(LEVELS[1], builder.name, text, remedy, sigma)
 
 
-def _clocks(facts: Facts) -> Iterator[Reason]:
-    for name in facts.solved.fixes:
-        offset = facts.solved.estimate.offset_s(name)
+def _clocks(inputs: VerdictInputs) -> Iterator[Reason]:
+    for name in inputs.solved.fixes:
+        offset = inputs.solved.estimate.offset_s(name)
         if abs(offset) > LATE_S:
             text = f"its clock is found {offset:+.2f} s off, more than a receiver is late"
             yield Reason(LEVELS[1], name, text, "correct its stamps", offset)
 
 
-def _biases(facts: Facts) -> Iterator[Reason]:
-    noise, bias = facts.solved.problem.calibration.imu_noise, facts.solved.estimate.states()[3]
+def _biases(inputs: VerdictInputs) -> Iterator[Reason]:
+    noise, bias = inputs.solved.problem.calibration.imu_noise, inputs.solved.estimate.states()[3]
     parts = {
         "accelerometer": (bias[:, :3], noise.accel_bias_sigma, "m/s^2"),
         "gyro": (bias[:, 3:], noise.gyro_bias_sigma, "rad/s"),
@@ -168,12 +168,12 @@ def _biases(facts: Facts) -> Iterator[Reason]:
             yield Reason(LEVELS[1], "imu", text, "check its units, axes and scale, or calibrate the device", size)
 
 
-def _alike(facts: Facts) -> Iterator[Reason]:
+def _alike(inputs: VerdictInputs) -> Iterator[Reason]:
     """Residuals of neighbouring fixes that are alike: an error of the fixes that lasts, or of the solution."""
-    for name, residuals in facts.solved.fixes.items():
-        used = facts.solved.pass_state.used(name, residuals.rows)
+    for name, residuals in inputs.solved.fixes.items():
+        used = inputs.solved.pass_state.used(name, residuals.rows)
         white = (residuals.residual / residuals.sigma)[used, :2]
-        if len(white) <= LEAST_PAIRS or name in facts.solved.pass_state.correlated:
+        if len(white) <= LEAST_PAIRS or name in inputs.solved.pass_state.correlated:
             continue
         rho = float((white[1:] * white[:-1]).sum() / max(float((white**2).sum()), 1e-12))
         if rho > ALIKE:
@@ -181,15 +181,15 @@ def _alike(facts: Facts) -> Iterator[Reason]:
             yield Reason(LEVELS[1], name, text, "give larger sigmas; the covariance is too small", rho)
 
 
-def _predictions(facts: Facts) -> Iterator[Reason]:
+def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
     """Withheld fixes: the solution against interpolation of the kept ones."""
-    session = facts.solved.problem.session
-    for name, held in facts.withheld.items():
+    session = inputs.solved.problem.session
+    for name, held in inputs.withheld.items():
         stream, rows = session.positions().get(name), len(held.t_ns)
         if stream is None or rows < LEAST_WITHHELD or len(stream) < 2:
             continue
-        missing = session.nav_position(facts.solved.problem.withheld[name])
-        at = np.searchsorted(facts.solved.problem.withheld[name].t_ns, held.t_ns)
+        missing = session.nav_position(inputs.solved.problem.withheld[name])
+        at = np.searchsorted(inputs.solved.problem.withheld[name].t_ns, held.t_ns)
         line = interpolate(held.t_ns, stream.t_ns, session.nav_position(stream)) - missing[at]
         ours, theirs = _rms(held.error), _rms(line)
         if ours > WORSE_THAN_INTERPOLATION * theirs:
@@ -201,10 +201,10 @@ def _rms(error: Floats) -> float:
     return float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
 
 
-def _recording(facts: Facts) -> Iterator[Reason]:
+def _recording(inputs: VerdictInputs) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
-    t0 = facts.solved.problem.session.t0_ns
-    for finding in facts.solved.problem.findings:
+    t0 = inputs.solved.problem.session.t0_ns
+    for finding in inputs.solved.problem.findings:
         if any(word in finding.text for word in HARMLESS):
             continue
         level = LEVELS[2] if any(word in finding.text for word in AXES) else LEVELS[1]
@@ -212,8 +212,8 @@ def _recording(facts: Facts) -> Iterator[Reason]:
         yield Reason(level, finding.where, finding.text, finding.remedy, finding.size, start, end)
 
 
-def _solver(facts: Facts) -> Iterator[Reason]:
-    if not facts.solved.estimate.converged:
+def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
+    if not inputs.solved.estimate.converged:
         text = "the iteration limit was reached before the cost settled"
         yield Reason(LEVELS[1], "solve", text, "raise solver.max_iterations")
 
