@@ -60,7 +60,7 @@ class Notes:
 
 
 # Scatter of positions, in units of their sigmas, beyond which these are not believed; smaller scatter may be a motion.
-CLAIM, LEAST_SCATTER_M = 2.0, 0.5
+CLAIM, LEAST_SCATTER_M, LEAST_SCATTERED = 2.0, 0.5, 20
 
 PreparationStep = Callable[[Session, Notes], Session]
 
@@ -168,7 +168,7 @@ def check_sigmas(session: Session, notes: Notes) -> Session:
         late = notes.causal & (stream.available_ns > notes.span[0] + round(INITIALISATION_S * NS))
         t_ns, position = stream.t_ns[~late], session.nav_position(stream)[~late, :2]
         found, relative = scatter(t_ns, position), scatter(t_ns, position, stream.sigma[~late, :2])
-        if found is None or relative is None or not found.is_noise:
+        if found is None or relative is None or not found.is_noise or found.rows < LEAST_SCATTERED:
             continue
         if found.sigma > LEAST_SCATTER_M and relative.sigma > CLAIM:
             changes[name] = replace(stream, sigma=stream.sigma * relative.sigma)

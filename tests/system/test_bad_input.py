@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -126,11 +125,12 @@ def test_a_stretch_without_fixes_is_no_start(eight):
     [("accel", 1 / 9.81, "units of g"), ("accel", 9.81, "scaled by 9.81 twice"), ("gyro", 57.2958, "deg/s")],
 )
 def test_wrong_units_are_reported(eight, field, factor, reported):
-    """Smoothed with a warning; or refused with a pointer to `info`, which reports it. Never passed over."""
+    """Refused, with the repair that converts them."""
     wrong = with_imu(eight, **{field: getattr(eight.imu, field) * factor})
-    with contextlib.suppress(SolverError):
-        assert any(reported in text for text in sn.run(wrong).summary["warnings"])
-    assert any(reported in text for text in inspect(wrong).warnings())
+    with pytest.raises(SessionError, match=reported) as error:
+        sn.run(wrong)
+    assert "--repair units" in str(error.value)
+    assert any(reported in str(finding) for finding in inspect(wrong).findings)
 
 
 @pytest.mark.parametrize("field", ["accel", "gyro"])

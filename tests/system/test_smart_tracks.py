@@ -110,7 +110,10 @@ def test_without_pairs_tracks_are_tested_by_the_other_sensors_alone(room):
 def test_a_replay_has_pairs_and_its_polish_tracks(room, run):
     replayed = replay(room, options())
     assert "smart" in replayed.summary["factors"]
-    np.testing.assert_allclose(replayed.solution.nav_t_body, run.solution.nav_t_body, atol=0.01)  # m
+    # images refute a standstill sooner or later, and with it goes a keyframe
+    common, one, other = np.intersect1d(replayed.solution.t_ns, run.solution.t_ns, return_indices=True)
+    assert len(common) > 0.98 * len(run.solution.t_ns)
+    np.testing.assert_allclose(replayed.solution.nav_t_body[one], run.solution.nav_t_body[other], atol=0.01)  # m
     pairs = replay(room, config.from_dict({"replay": {"polish": False}}, "test"))
     np.testing.assert_allclose(replayed.causal.nav_t_body, pairs.causal.nav_t_body, atol=1e-9)
 

@@ -50,8 +50,8 @@ LEAST_SIGMA = 0.03
 LEAST_REDUNDANCY = 10.0
 # What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
 PRIOR_FIXES = 30.0
-# Share and number of rejected fixes above which the solution is suspect.
-SUSPECT_SHARE, LEAST_SUSPECTS = 0.1, 10
+# Share and number of rejected fixes above which the solution is suspect; above the last share whatever their number.
+SUSPECT_SHARE, LEAST_SUSPECTS, MOST_REJECTED = 0.1, 10, 0.15
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
 SURPRISE = 0.01
 # Noise is found once the logarithm of its sigma changes by less than this: fixes, and inertial groups, whose walks
@@ -98,15 +98,17 @@ def _update_noise_and_fixes(
         new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
     worst = {v.name: v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested}
-    if pass_state.phase is Phase.PLAIN and any(worst.values()) and not pass_state.trusted:
+    if pass_state.phase is Phase.PLAIN and any(worst.values()):
         return replace(new, phase=Phase.ROBUST), False
     if pass_state.narrowing:
         return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
     outliers = {v.name: v.outside() - pass_state.trusted.get(v.name, frozenset()) for v in tested}
     trusted = {name: suspects(builder, outliers.get(name, frozenset())) for name, (builder, _) in found.items()}
     if any(trusted.values()):  # least squares again, with them
+        outliers = {name: rows - trusted.get(name, frozenset()) for name, rows in outliers.items()}
         trusted = {name: rows | pass_state.trusted.get(name, frozenset()) for name, rows in trusted.items()}
-        return replace(new, phase=Phase.PLAIN, rejected={}, weights={}, trusted=trusted, noise_scales={}), False
+        new = replace(new, phase=Phase.GATED, rejected=outliers, weights={}, robust_floor_m=0.0)
+        return replace(new, trusted=trusted, noise_scales={}), False
     if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
         weighed = _next_gnc(tested, pass_state)
         if weighed is not None:
@@ -125,10 +127,11 @@ def _update_noise_and_fixes(
 
 
 def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[int]:
-    """Rejected fixes that agree with their neighbours, where a large share is rejected: not they are suspect, but the
-    solution. A run of rejected fixes must agree with those before and after it too: a burst of outliers does not."""
+    """Rejected fixes that agree with their neighbours, where a large share is rejected and most of it agrees: not they
+    are suspect, but the solution. A run of rejected fixes must agree with those before and after it too: a burst of
+    outliers does not. A few are left alone."""
     n = len(builder.agrees)
-    if len(rejected) <= max(SUSPECT_SHARE * n, LEAST_SUSPECTS):
+    if len(rejected) <= min(max(SUSPECT_SHARE * n, LEAST_SUSPECTS), MOST_REJECTED * n):
         return frozenset()
     out = np.isin(np.arange(n), list(rejected))
     found = [
@@ -136,7 +139,8 @@ def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[in
         for first, end in runs(out)
         if builder.agrees[[*range(max(first - 1, 2), first + 1), *range(end - 1, min(end, n - 3) + 1)]].all()
     ]
-    return frozenset(row for run in found for row in run)
+    agreeing = frozenset(row for run in found for row in run)
+    return agreeing if len(agreeing) > len(rejected) / 2 else frozenset()
 
 
 def widen_robust_scale(builders: Iterable[Builder], pass_state: PassState, metres: float) -> PassState:

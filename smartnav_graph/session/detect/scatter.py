@@ -7,7 +7,7 @@ white part of the fixes and the motion that no cubic follows. With weights w_j o
 
     r = p - sum_j w_j p_j        var r = sigma^2 (1 + sum_j w_j^2)
 
-and the median of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
+and a low quantile of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
 leaves the same sigma, motion a larger one; and neighbouring r of white noise are of opposite sign (their correlation is
 -0.8), those of a motion are not. Fixes too far apart follow no motion, and their scatter is an upper bound.
 
@@ -26,6 +26,8 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
 
 LEAST_FIXES = 12
+# An outlier spoils five residuals: among a fifth of outliers this share of the smallest residuals has none.
+QUANTILE = 0.25
 # Share of good fixes that agree with their neighbours.
 AGREES = 0.999
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
@@ -93,7 +95,7 @@ def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
 def _sigma(residual: Floats) -> float:
     square = (residual**2).sum(axis=1)
     dim = residual.shape[1]
-    return float(np.sqrt(np.median(square[np.isfinite(square)]) / chi2(dim).median()))
+    return float(np.sqrt(np.quantile(square[np.isfinite(square)], QUANTILE) / chi2(dim).ppf(QUANTILE)))
 
 
 def sampling_noise(imu: Imu) -> tuple[float, float]:
