@@ -82,7 +82,7 @@ def test_a_loss_that_loses_its_way_begins_again_from_least_squares():
     """A good fix looks wrong in the first minute; among outliers looked for stretch by stretch, the drive is lost."""
     session = sn.simulate("phone-car-5min", 26)
     run = sn.run(session)
-    assert run.summary["converged"] and not run.summary["rejected"]
+    assert run.summary["converged"] and not any(run.summary["rejected"].values())
     at = np.searchsorted(session.reference.t_ns, run.solution.t_ns[[100, 200]])
     assert np.linalg.norm(run.solution.nav_t_body[[100, 200]] - session.reference.enu[at], axis=1).max() < 15.0
 

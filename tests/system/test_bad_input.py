@@ -239,7 +239,7 @@ def test_fixes_of_another_motion_do_not_pass_for_a_solution(eight, clean):
     run = sn.run(other)
     assert_finite(run)
     summary = run.summary
-    assert not summary["converged"] or summary["chi2_per_dof"]["overall"] > 10.0
+    assert summary["verdict"]["level"] == "contradictory" and summary["chi2_per_dof"]["overall"] > 5.0
     assert any(text.startswith("solve: ") for text in summary["warnings"])  # and a good fit says nothing of the kind
     assert not any(text.startswith("solve: ") for text in clean.summary["warnings"])
 
@@ -274,7 +274,8 @@ def test_a_drive_started_ten_kilometres_off(kitti):
     near, far = (sn.smooth(kitti, initial=f"{start},0,1e5,180") for start in ("0,0,0", "7000,-7000,300"))
     assert np.linalg.norm(near.nav_t_body - far.nav_t_body, axis=1).max() < 1e-3  # m
     batch = sn.smooth(kitti)
-    assert np.linalg.norm(batch.nav_t_body - far.nav_t_body, axis=1).max() < 0.1  # m: another prior of tilt
+    off = np.linalg.norm(batch.nav_t_body - far.nav_t_body, axis=1)  # another prior of tilt; in data gaps, other noise
+    assert np.quantile(off, 0.95) < 0.1 and off.max() < 1.0  # m
 
 
 # ---- rates and shared epochs
