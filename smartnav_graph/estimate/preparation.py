@@ -36,8 +36,8 @@ class Notes:
     """What the steps find beside the session.
 
     causal : for a replay; span : first and last stamp to smooth; gaps : of the inertial data inside it
-    clocks : comparison of the sensors' clocks; withheld : rows held out, by stream; dropped : rows that are not used,
-    by stream and reason
+    clocks : comparison of the sensors' clocks; findings : warnings of the health; withheld : rows held out, by stream
+    dropped : rows that are not used, by stream and reason
     """
 
     config: Config

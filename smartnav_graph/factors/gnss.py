@@ -27,11 +27,9 @@ from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
 from smartnav_graph.session.detect.scatter import Scatter, agrees_with_neighbours, scatter
 from smartnav_graph.session.stream import Positioned
-
-LEAST_CORRELATED_SIGMA = 0.5  # m
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
@@ -153,8 +151,9 @@ class PositionBuilder(Builder):
             first = max(session.t0_ns + round(INITIALISATION_S * NS), int(stream.available_ns.min()))
             typical = stream.available_ns <= first
         t_ns, known = stream.t_ns[typical], position[typical]
-        agrees = agrees_with_neighbours(stream.t_ns, position[:, :2])
         parts = scatter(t_ns, known[:, :2]), scatter(t_ns, known[:, 2:])
+        agrees = np.zeros(len(stream), dtype=bool)
+        agrees[typical] = agrees_with_neighbours(t_ns, known[:, :2])
         return cls(
             name,
             position,
@@ -171,7 +170,7 @@ class PositionBuilder(Builder):
 
     def has_correlated_error(self, pass_state: PassState, *, doubtful: bool = False) -> bool:
         """Whether these fixes are of a code receiver: by the device's noise, unless they are better than
-        `LEAST_CORRELATED_SIGMA`. Better ones are of carrier phase, without correlated errors of metres. A receiver
+        `CARRIER_PHASE_SIGMA`. Better ones are of carrier phase, without correlated errors of metres. A receiver
         that filters its fixes appears to be better too: without sigmas of their own that counts only where nothing
         else is `doubtful`."""
         if not (self.noise.is_correlated and self.config.correlated):
@@ -179,7 +178,7 @@ class PositionBuilder(Builder):
         typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
         stated = float(self.own_sigma[self.typical].mean()) > 0.5
         known = self.name in pass_state.correlated
-        return known or typical >= LEAST_CORRELATED_SIGMA or (doubtful and not stated)
+        return known or typical >= CARRIER_PHASE_SIGMA or (doubtful and not stated)
 
     @property
     def noise_names(self) -> tuple[str, str]:

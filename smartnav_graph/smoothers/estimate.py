@@ -52,7 +52,7 @@ class Posterior:
     session: Mapping[int, Floats]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """What a smoother ends with.
 

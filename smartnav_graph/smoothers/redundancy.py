@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import gtsam
 import numpy as np
@@ -60,14 +61,24 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
     return {name: Redundancy(int(count), *rest) for name, (count, *rest) in total.items()}
 
 
-def factor_fits(estimate: Estimate) -> Iterator[FactorFit]:
-    """The fit of every factor in use, in no particular order.
+# Fits of the estimates that are still in use: the last pass and the summary ask for the same ones.
+_FITS: WeakKeyDictionary[Estimate, Sequence[FactorFit]] = WeakKeyDictionary()
+
+
+def factor_fits(estimate: Estimate) -> Sequence[FactorFit]:
+    """The fit of every factor in use, in no particular order; found once for an estimate.
 
     Raises
     ------
     RuntimeError
         A keyframe is not determined.
     """
+    if estimate not in _FITS:
+        _FITS[estimate] = tuple(_factor_fits(estimate))
+    return _FITS[estimate]
+
+
+def _factor_fits(estimate: Estimate) -> Iterator[FactorFit]:
     names, linear = _linearized(estimate)
     session, groups = _states(linear, estimate)
     place = {name: row for row, group in enumerate(groups) for name in group}

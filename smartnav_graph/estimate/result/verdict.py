@@ -21,11 +21,11 @@ from smartnav_graph.core.arrays import Floats, runs
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
-from smartnav_graph.estimate.reweight.imu_noise import WIDEST_OF_SAMPLES, WORSE, worse_than_class
+from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
-from smartnav_graph.factors.gnss import LEAST_CORRELATED_SIGMA
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
+from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA
 
 LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
@@ -42,12 +42,8 @@ LATE_S = 1.2
 FAR = 4.0
 # Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
 ALIKE, LEAST_PAIRS = 0.35, 40
-# RMS at withheld fixes against that of interpolating the kept ones; share of them inside 95 %.
-WORSE_THAN_INTERPOLATION, LEAST_INSIDE, LEAST_WITHHELD = 1.1, 0.8, 20
-# Findings on the recording that put its geometry in doubt.
-AXES = ("axes", "axis", "turns against", "mirrored", "swapped", "north, east, down", "opposite", "left-handed")
-# Findings that the estimate takes account of.
-HARMLESS = ("data gap", "outside the imu's span", "no sigma", "no absolute sensor", "too low to follow")
+# RMS at withheld fixes against that of interpolating the kept ones, and the least number of them.
+WORSE_THAN_INTERPOLATION, LEAST_WITHHELD = 1.1, 20
 
 
 @dataclass(frozen=True)
@@ -127,20 +123,16 @@ def _rejected_runs(inputs: VerdictInputs, name: str, residuals: FixResiduals, ou
 
 def _noise(inputs: VerdictInputs) -> Iterator[Reason]:
     imu, pass_state = one_of(inputs.solved.problem.builders, ImuBuilder), inputs.solved.pass_state
-    if imu is None or not worse_than_class(imu, pass_state):
-        return
-    for name, own in imu.sampling_scales().items():
-        found = pass_state.scale(name)
-        if found > WORSE * max(1.0, WIDEST_OF_SAMPLES * own):
-            text = f"noise of the {name} is found {found:.1f} times that of its class, and its samples do not show it"
-            yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
+    for name, found in worse_than_class(imu, pass_state).items() if imu is not None else ():
+        text = f"noise of the {name} is found {found:.1f} times that of its class, and its samples do not show it"
+        yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
 
 
 def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
     """Fixes without sigmas that agree with each other, but with the inertial data only by a correlated error."""
     for builder in position_builders(inputs.solved.problem.builders):
         sigma = float(np.median(builder.scaled_sigma(inputs.solved.pass_state)[:, :2]))
-        if builder.name in inputs.solved.pass_state.correlated and sigma < LEAST_CORRELATED_SIGMA:
+        if builder.name in inputs.solved.pass_state.correlated and sigma < CARRIER_PHASE_SIGMA:
             text = f"fixes agree with each other to {sigma:.2f} m, but not so with the inertial data"
             remedy = "they may be filtered, or a lever arm, scale or height wrong; give sigmas where they are right"
 
@@ -205,11 +197,10 @@ def _recording(inputs: VerdictInputs) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
     t0 = inputs.solved.problem.session.t0_ns
     for finding in inputs.solved.problem.findings:
-        if any(word in finding.text for word in HARMLESS):
+        if finding.verdict == LEVELS[0]:
             continue
-        level = LEVELS[2] if any(word in finding.text for word in AXES) else LEVELS[1]
         start, end = (None if t_ns is None else (t_ns - t0) / NS for t_ns in (finding.start_ns, finding.end_ns))
-        yield Reason(level, finding.where, finding.text, finding.remedy, finding.size, start, end)
+        yield Reason(finding.verdict, finding.where, finding.text, finding.remedy, finding.size, start, end)
 
 
 def _solver(inputs: VerdictInputs) -> Iterator[Reason]:

@@ -205,9 +205,10 @@ def noise_scales(
     }
 
 
-def worse_than_class(builder: ImuBuilder, pass_state: PassState) -> bool:
-    """Whether the white inertial noise found is beyond its class and beyond what the samples show by themselves."""
-    return any(
-        pass_state.scale(name) > WORSE * max(1.0, WIDEST_OF_SAMPLES * own)
+def worse_than_class(builder: ImuBuilder, pass_state: PassState) -> dict[str, float]:
+    """Scales of the white inertial noise found, where they are beyond its class and what the samples show."""
+    return {
+        name: pass_state.scale(name)
         for name, own in builder.sampling_scales().items()
-    )
+        if pass_state.scale(name) > WORSE * max(1.0, WIDEST_OF_SAMPLES * own)
+    }

@@ -93,7 +93,7 @@ def _update_noise_and_fixes(
     found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
     new = pass_state
     exact = pass_state.stage == LAST_STAGE and pass_state.phase in (Phase.PLAIN, Phase.GATED)
-    fits = list(factor_fits(estimate)) if exact else []
+    fits = factor_fits(estimate) if exact else ()
     for builder, residuals in found.values():
         new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
@@ -187,7 +187,7 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     """The pass state with what joins once the trajectory is found; session states that are not observable are fixed."""
     positions = position_builders(builders)
     imu = one_of(builders, ImuBuilder)
-    doubtful = imu is not None and pass_state.stage == LAST_STAGE and worse_than_class(imu, pass_state)
+    doubtful = imu is not None and pass_state.stage == LAST_STAGE and bool(worse_than_class(imu, pass_state))
     correlated = frozenset(b.name for b in positions if b.has_correlated_error(pass_state, doubtful=doubtful))
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)

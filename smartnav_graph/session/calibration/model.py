@@ -41,6 +41,10 @@ class ImuNoise:
     gyro_bias_sigma: float
 
 
+# Sigma (m) of fixes below which they are of carrier phase, without correlated errors of metres.
+CARRIER_PHASE_SIGMA = 0.5
+
+
 @dataclass(frozen=True)
 class GnssNoise:
     """Noise of position fixes, metres.

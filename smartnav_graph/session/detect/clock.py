@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Indices, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.detect.motion import STEP_S, Complexes, InertialMotion
 
@@ -30,7 +30,7 @@ _AGREE_S = 2.5  # between the peaks of both
 _FLOOR = 0.1  # m; smaller residuals count the same
 _OVERLAP_S = 10.0  # of both sensors, at least
 _WINDOWS = ((20.0, 3), (40.0, 5))  # length, s, and degree of the polynomial
-_SPACING_S = 0.95  # between fixes that are used
+SPACING_S = 0.95  # between fixes that are used
 _COARSE_S, _FINE_S = 0.25, 0.02
 _LONG_SEARCH_S = 3600.0  # more lags than that in steps twice as long
 _MOST_FIXES = 600  # of the search; the refinement takes all
@@ -38,6 +38,18 @@ _LONG_CHORD_S, _BLOCK_S = 4.0, 60.0
 _MOST_RATE = 0.02  # rad/s
 LEAST_SIGMA_S = 0.05
 LEAST_FIXES = 10
+
+
+def spaced_rows(t_ns: Times, position: Floats) -> Indices:
+    """Rows of positions (n, 2) m at least `SPACING_S` apart, as closer ones share their errors, without those that
+    repeat the position before or are not known."""
+    new = np.concatenate([[True], np.diff(position, axis=0).any(axis=1)])[: len(t_ns)]
+    rows, last = list[int](), -(2**62)
+    for row in np.flatnonzero(new & np.isfinite(position).all(axis=1)).tolist():
+        if t_ns[row] - last >= SPACING_S * NS:
+            rows.append(row)
+            last = int(t_ns[row])
+    return np.array(rows, dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -68,15 +80,8 @@ class FixTrack:
     @classmethod
     def of(cls, t_ns: Times, position: Floats, start_ns: int) -> FixTrack:
         """Of fixes (n, >= 2) m, some second apart, without those that repeat the position before."""
-        new = np.concatenate([[True], np.diff(position[:, :2], axis=0).any(axis=1)])[: len(t_ns)]
-        new &= np.isfinite(position[:, :2]).all(axis=1)
-        t, p = (t_ns[new] - start_ns) / NS, position[new, 0] + 1j * position[new, 1]
-        kept, last = [], -np.inf
-        for row, time in enumerate(t):
-            if time - last >= _SPACING_S:
-                kept.append(row)
-                last = time
-        return cls(t[kept], p[kept])
+        rows = spaced_rows(t_ns, position[:, :2])
+        return cls((t_ns[rows] - start_ns) / NS, position[rows, 0] + 1j * position[rows, 1])
 
     def __len__(self) -> int:
         return len(self.t)

@@ -22,7 +22,8 @@ from scipy.stats import t as student_t
 
 from smartnav_graph.core.arrays import Floats, Times, runs
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.session.calibration.model import GnssNoise
+from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
+from smartnav_graph.session.detect.clock import spaced_rows
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
@@ -32,14 +33,12 @@ from smartnav_graph.session.streams import Imu
 LEAST_SPEED, SIGNIFICANT = 0.3, 5.0
 # Lengths (s) of the windows that positions are tested in, the share of one that they span, and how many it takes.
 WINDOWS_S, SPANNED, LEAST_FIXES = (5.0, 10.0, 20.0, 40.0, 80.0), 0.8, 5
-# Positions are used at most this often (s): closer ones share their errors. In a batch run windows of a length L are
-# tested every L / `HOPS`, and rests shorter than this (s) beside motion without a border between them are none.
-SPACING_S, HOPS, SHORT_S = 0.95, 4, 10.0
+# In a batch run windows of a length L are tested every L / `HOPS`, and rests shorter than this (s) beside motion
+# without a border between them are none.
+HOPS, SHORT_S = 4, 10.0
 # Longest step (s) of the inertial data between two standstills that are tested as one, and how many sigmas of their
 # noise the speed may seem to change by.
 LONGEST_STEP_S, NOISE_SIGMAS = 0.5, 4.0
-# Sigma (m) of positions below which a receiver has no more correlated error than that.
-CARRIER_PHASE = 0.5
 # Variance of a median of slopes over that of the least squares slope, about; sigma over a median absolute deviation.
 THEIL_SEN, MAD = 1.1, 1.4826
 # What a jump may explain better by chance, as a logarithm.
@@ -178,7 +177,7 @@ class _Positions:
         off -= np.median(off, axis=0)
         scatter = MAD * float(np.median(np.abs(off))) * np.sqrt(len(t) / (len(t) - 2.0))
         white = max(scatter, 0.5 * stated if np.isfinite(stated) else 0.0, 1e-3)
-        correlated = min(self.correlated, stated) if stated < CARRIER_PHASE else self.correlated
+        correlated = min(self.correlated, stated) if stated < CARRIER_PHASE_SIGMA else self.correlated
         weight = t - t.mean()
         weight /= weight @ weight
         drift = correlated**2 * np.exp(-np.abs(t[:, None] - t) / self.correlated_s)
@@ -191,12 +190,7 @@ class _Positions:
 
 def _positions(session: Session, stream: Positioned, noise: GnssNoise) -> _Positions:
     p = session.nav_position(stream)[:, :2]
-    new = np.concatenate([[True], np.any(np.diff(p, axis=0) != 0.0, axis=1)])
-    rows, last = list[int](), -(2**62)
-    for row in np.flatnonzero(new & np.isfinite(p).all(axis=1)).tolist():
-        if stream.t_ns[row] - last >= SPACING_S * NS:
-            rows.append(row)
-            last = int(stream.t_ns[row])
+    rows = spaced_rows(stream.t_ns, p)
     sigma = np.full(len(p), np.nan) if stream.sigma is None else stream.sigma[:, :2].max(axis=1)
     correlated = noise.correlated_horizontal_sigma if stream.NAME == "gnss" else 0.0
     known = np.maximum.accumulate(np.maximum(stream.available_ns, stream.t_ns)[rows])

@@ -48,7 +48,7 @@ def up_axis(facts: Facts) -> Iterator[Finding]:
         remedy = f'flip the sign of accel, or set [device] up = "{axis}" in session.toml'
     else:
         remedy = f'set [device] up = "{axis}" (and forward) in session.toml'
-    yield Finding("imu", found, remedy, size=round(angle, 1))
+    yield Finding("imu", found, remedy, verdict="contradictory", size=round(angle, 1))
 
 
 def axes_finding(session: Session, fault: AxesFault) -> Finding:
@@ -64,7 +64,8 @@ def axes_finding(session: Session, fault: AxesFault) -> Finding:
         axes.text if axes.sensor == likely[0].sensor else f"{axes.sensor} {axes.text}" for axes in likely
     )
     remedy = f"{_REMEDIES[likely[0].sensor]} where the log is imported"
-    return Finding(where, f"{text} {named} (log likelihood +{fault.gain:.0f})", remedy, size=round(fault.gain, 1))
+    text = f"{text} {named} (log likelihood +{fault.gain:.0f})"
+    return Finding(where, text, remedy, verdict="contradictory", size=round(fault.gain, 1))
 
 
 RULES = (up_axis,)

@@ -27,6 +27,8 @@ _ODD = 1.3  # a factor that slip or tyres do not explain
 class Finding:
     """One finding. level is ``error`` (no estimation possible), ``warning`` (looks wrong) or ``info``.
 
+    verdict : what a warning makes of a run: ``good``, where the estimate takes account of it, ``doubtful``, or
+    ``contradictory``, where the geometry of a sensor is wrong
     size : of the fault, in the unit of the text; start_ns, end_ns : where it is, where it is not everywhere
     convert : field of the stream `where` that is in another unit, and the factor to the right one
     """
@@ -35,6 +37,7 @@ class Finding:
     text: str
     remedy: str = ""
     level: str = "warning"
+    verdict: str = "doubtful"
     size: float | None = None
     start_ns: int | None = None
     end_ns: int | None = None

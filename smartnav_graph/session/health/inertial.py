@@ -64,7 +64,7 @@ def _gaps(facts: Facts) -> Iterator[Finding]:
             total, longest = sum(gap.length_s for gap in gaps), max(gaps, key=lambda gap: gap.length_s)
             at, count = float(facts.session.seconds(longest.start_ns)), count_of(len(gaps), "data gap")
             text = f"{count} {what}, {total:.2f} s in all, longest {longest.length_s:.2f} s at {at:.2f} s"
-            yield Finding("imu", text, "the uncertainty grows there; fixes around them help")
+            yield Finding("imu", text, "the uncertainty grows there; fixes around them help", verdict="good")
 
 
 def _accel_unit(facts: Facts) -> Iterator[Finding]:
@@ -104,7 +104,7 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
         yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
     elif errors is not None and errors[1.0] > 5.0 and errors[-1.0] < errors[1.0] / 4:
         text = "gyro turns against the tilt that accel shows: its sign is wrong"
-        yield Finding("imu", text, "flip the sign of gyro")
+        yield Finding("imu", text, "flip the sign of gyro", verdict="contradictory")
     elif errors is not None and errors[1.0] > 5.0 and errors[180 / np.pi] < errors[1.0] / 4:
         text = "accel tilts 57.3 times faster than gyro turns: gyro looks converted from deg to rad twice"
         yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 1.0 / _DEG)

@@ -248,7 +248,7 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
     vertical = float(np.median(Rotation.from_quat(readings["unchanged"]).apply(up)[:, 2]))
     if vertical < -0.5 * facts.session.gravity:
         text = f"attitudes turn specific force to {vertical:.1f} m/s^2 along up: they look like north, east, down"
-        yield Finding("pose_fixes", text, "give nav_R_body with nav = east, north, up")
+        yield Finding("pose_fixes", text, "give nav_R_body with nav = east, north, up", verdict="contradictory")
 
 
 def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:

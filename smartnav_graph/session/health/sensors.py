@@ -135,7 +135,7 @@ def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
     correlation = slope * np.sqrt(power / max(float((change**2).sum()), 1e-12))
     if correlation < -_CORRELATED:
         text = "field turns against gyro: its axes are mirrored or exchanged, or the sign of gyro is wrong"
-        yield Finding("magnetometer", text, "give the field in body axes, right-handed")
+        yield Finding("magnetometer", text, "give the field in body axes, right-handed", verdict="contradictory")
     elif correlation > _CORRELATED and 30.0 < slope < 90.0:
         text = f"the field turns {slope:.0f} times as fast as gyro: it looks converted from deg to rad twice"
         yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 180.0 / np.pi)

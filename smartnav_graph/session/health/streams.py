@@ -31,7 +31,7 @@ def _rows(facts: Facts) -> Iterator[Finding]:
         yield Finding("imu", f"lasts {length:.3f} s only", "check the unit of its time stamps")
     if not session.absolute():
         text = f"no absolute sensor ({', '.join(ABSOLUTE)})"
-        yield Finding("session", text, "start from a standstill or with --initial for dead reckoning")
+        yield Finding("session", text, "start from a standstill or with --initial for dead reckoning", verdict="good")
 
 
 def dropped(facts: Facts) -> Iterator[Finding]:
@@ -70,7 +70,8 @@ def _clock(facts: Facts) -> Iterator[Finding]:
         yield Finding("imu", text, "t_ns counts nanoseconds; check the unit of the time stamps")
     elif rate < _SLOW_HZ:
         text = f"median rate {rate:.3g} Hz is too low to follow the motion between samples"
-        yield Finding("imu", text, f"record at {_SLOW_HZ:g} Hz at least; attitude and speed are uncertain")
+        remedy = f"record at {_SLOW_HZ:g} Hz at least; attitude and speed are uncertain"
+        yield Finding("imu", text, remedy, verdict="good")
 
 
 def _constant(facts: Facts) -> Iterator[Finding]:
@@ -125,7 +126,7 @@ def _overlap(facts: Facts) -> Iterator[Finding]:
                 f"{len(stream) - count} of {len(stream)} rows lie outside the imu's span "
                 f"0 to {(last - first) / NS:.3f} s (the stream spans {begin:.3f} to {end:.3f} s)"
             )
-            yield Finding(name, text, "they are not used; check that both use one clock")
+            yield Finding(name, text, "they are not used; check that both use one clock", verdict="good")
     absolute = [name for name in inside if name in ABSOLUTE]
     if absolute and not any(inside[name] for name in absolute):
         text = f"no row of {', '.join(absolute)} lies inside the imu's span 0 to {(last - first) / NS:.3f} s"
