@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from smartnav_graph.session.detect.scatter import LEAST_FIXES, agrees_with_neighbours, normalised_residuals, scatter
+from smartnav_graph.session.detect.scatter import (
+    LEAST_FIXES,
+    agrees_with_neighbours,
+    normalised_residuals,
+    sampling_noise,
+    scatter,
+)
+from smartnav_graph.session.streams import Imu
 
 NS = 10**9
 
@@ -76,3 +83,14 @@ def test_fixes_off_their_neighbours_do_not_agree_with_them() -> None:
     agrees = agrees_with_neighbours(stamps(100), position)
     assert not agrees[[0, 1, 40, 59, 60, 79, 80, 98, 99]].any()
     assert agrees[[10, 30, 50, 65, 70, 75, 90]].mean() > 0.8
+
+
+@pytest.mark.parametrize("hertz", [10.0, 200.0])
+def test_the_noise_between_inertial_samples_is_a_density_whatever_the_rate(hertz: float) -> None:
+    """White noise of density d has d sqrt(rate) a sample; a steady turn and acceleration add nothing."""
+    rng, n = np.random.default_rng(7), 4000
+    t = np.arange(n) / hertz
+    accel, gyro = 0.03 * np.sqrt(hertz) * rng.normal(size=(n, 3)), 0.002 * np.sqrt(hertz) * rng.normal(size=(n, 3))
+    imu = Imu(t_ns=stamps(n, 1.0 / hertz), accel=accel + 0.01 * t[:, None], gyro=gyro + 1.0)
+    assert sampling_noise(imu) == pytest.approx((0.03, 0.002), rel=0.1)
+    assert sampling_noise(imu.take(slice(0, LEAST_FIXES - 1))) == (0.0, 0.0)
