@@ -1,0 +1,97 @@
+"""The session of a log: streams with their counts, origin at the first fix, forward and up where the data show them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from smartnav_graph.core.arrays import Table
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.readers.axes import find_body_axes
+from smartnav_graph.readers.fixes import LoggedFixes, first_fix, fix_table
+from smartnav_graph.readers.samples import Samples, inertial_table, magnetic_table
+from smartnav_graph.readers.source import build_session
+from smartnav_graph.session.session import Device, Session
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class LogParts:
+    """Streams of a log while it is read: file and columns by name, and what was left out of each."""
+
+    tables: dict[str, tuple[Path, Table]] = field(default_factory=dict)
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+
+    def add(self, stream: str, file: Path, table: Table, counts: Mapping[str, int] | None = None) -> None:
+        """One more stream; counts of rows left out, by reason."""
+        self.tables[stream] = (file, table)
+        self.count(stream, counts or {})
+
+    def count(self, stream: str, counts: Mapping[str, int]) -> None:
+        """Counts of a stream, or of data that belong to none."""
+        known = self.counts.setdefault(stream, {})
+        for reason, count in counts.items():
+            if count:
+                known[reason] = known.get(reason, 0) + count
+
+    def add_imu(self, gyro: Samples, accel: Samples) -> None:
+        """The stream ``imu`` of angular rate rad/s and specific force m/s^2."""
+        self.add("imu", gyro.file, *inertial_table(gyro, accel))
+
+    def add_magnetometer(self, field_ut: Samples) -> None:
+        """The stream ``magnetometer`` of flux density uT."""
+        self.add("magnetometer", field_ut.file, magnetic_table(field_ut), field_ut.counts)
+
+    def add_single(self, stream: str, column: str, samples: Samples) -> None:
+        """A stream of one quantity, such as ``barometer`` with pressure_hpa."""
+        self.add(stream, samples.file, {"t_ns": samples.t_ns, column: samples.values[:, 0]}, samples.counts)
+
+    def add_fixes(self, file: Path, fixes: LoggedFixes) -> None:
+        """The stream ``gnss``; none where no row has a position."""
+        table, counts = fix_table(fixes)
+        if len(table["t_ns"]):
+            self.add("gnss", file, table, counts)
+        else:
+            self.count("gnss", counts)
+
+
+def log_session(
+    parts: LogParts,
+    repairs: tuple[str, ...],
+    *,
+    name: str,
+    epoch: str,
+    forward: str = "",
+    up: str = "",
+    vehicle: str = "none",
+) -> Session:
+    """The session of a log.
+
+    Parameters
+    ----------
+    name, epoch : of the device and its clock
+    forward, up : where the format defines them; else found in the data, and reported
+
+    Raises
+    ------
+    SessionError
+        No stream, or a faulty one.
+    """
+    if not parts.tables:
+        raise SessionError(name, "holds no stream", "inertial samples or fixes", "switch these sensors on")
+    imu, fixes = (parts.tables[stream][1] if stream in parts.tables else None for stream in ("imu", "gnss"))
+    if not up and imu is not None:
+        found = find_body_axes(imu, fixes if fixes is not None and "lat_deg" in fixes else None)
+        forward, up = forward or found.forward, found.up
+        source = "by the course of the fixes" if found.forward_found else "by default; the fixes do not show it"
+        _log.info("%s: up %s by gravity, forward %s %s", name, up, forward, source)
+    origin: Origin | None = first_fix(fixes) if fixes is not None and "lat_deg" in fixes else None
+    device = Device(name=name, forward=forward or "+y", up=up or "+z", vehicle=vehicle)
+    session = build_session(parts.tables, repairs, device=device, clock_epoch=epoch, origin=origin)
+    names = [*parts.counts, *(stream for stream in session.dropped if stream not in parts.counts)]
+    dropped = {stream: {**parts.counts.get(stream, {}), **session.dropped.get(stream, {})} for stream in names}
+    return session.replace(dropped={stream: counts for stream, counts in dropped.items() if counts})
