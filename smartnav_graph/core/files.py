@@ -17,6 +17,8 @@ import pyarrow.parquet as pq
 from smartnav_graph.core.arrays import Column, Table
 from smartnav_graph.core.errors import SessionError, SmartnavError
 
+ROW_GROUP = 1 << 20
+
 
 def read_toml(path: Path, fault: type[SmartnavError], what: str) -> dict[str, Any]:
     """The tables of a TOML file; `what` it should be (``a config.toml``) is part of the `fault` raised otherwise."""
@@ -86,8 +88,14 @@ def refuse_foreign(path: str | Path, mark: str) -> None:
 
 
 def write_table(columns: Mapping[str, Column], path: Path) -> None:
-    """Write columns as a Parquet file."""
-    pq.write_table(pa.table({name: pa.array(column) for name, column in columns.items()}), path)
+    """Write columns as a Parquet file, `ROW_GROUP` rows at a time: no second copy of a long recording in memory."""
+    schema = pa.schema(
+        [(name, pa.array(column if column.dtype == object else column[:0]).type) for name, column in columns.items()]
+    )
+    count = max(map(len, columns.values()), default=0)
+    with pq.ParquetWriter(path, schema) as file:
+        for rows in (slice(first, first + ROW_GROUP) for first in range(0, max(count, 1), ROW_GROUP)):
+            file.write_table(pa.table({name: pa.array(column[rows]) for name, column in columns.items()}, schema))
 
 
 def read_table(path: Path) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import MISSING
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,16 @@ def _columns(kind: type[Stream], table: TextTable) -> Table:
     if unknown:
         _log.warning("%s: unknown column %s; kept, but not used", table.path, unknown)
     columns: Table = {}
+    for spec in kind.specs():
+        names = spec.metadata["columns"]
+        if len(names) > 1 and spec.default is MISSING and set(names) <= set(table.cells):
+            rows = table.floats(*names)
+            rows.flags.writeable = False  # the stream keeps them as they are
+            columns |= dict(zip(names, rows.T, strict=True))
     for name in table.cells:
-        if name in optional and table.is_empty(name):
-            continue
-        columns[name] = _column(table, name, kinds.get(name))
-    return columns
+        if name not in columns and not (name in optional and table.is_empty(name)):
+            columns[name] = _column(table, name, kinds.get(name))
+    return {name: columns[name] for name in table.cells if name in columns}
 
 
 def _column(table: TextTable, name: str, kind: str | None) -> Column:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gzip
-import io
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,9 @@ from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_text
 
+BLOCK = 32 << 20  # bytes that are parsed at once; of a longer file one column at a time is held as text
+ROWS = 1 << 16  # stamps that are converted at once
+
 
 def read_bytes(path: Path) -> bytes:
     """The bytes of a file; those inside where its name ends in .gz.
@@ -28,9 +31,15 @@ def read_bytes(path: Path) -> bytes:
     SessionError
         Missing, unreadable or damaged.
     """
+    return b"".join(_chunks(path))
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    """The bytes of `read_bytes`, `BLOCK` at a time."""
     try:
-        data = path.read_bytes()
-        return gzip.decompress(data) if path.suffix == ".gz" else data
+        with cast(BinaryIO, gzip.open(path)) if path.suffix == ".gz" else path.open("rb") as file:
+            while data := file.read(BLOCK):
+                yield data
     except FileNotFoundError as error:
         raise SessionError(path, "is missing", "a text file", "check the path") from error
     except (OSError, EOFError, zlib.error) as error:  # the last two: a damaged gzip file
@@ -52,7 +61,7 @@ class TextTable:
     """Cells of a delimited text file, still as text; conversion on demand, so that stamps keep every digit."""
 
     path: Path
-    cells: dict[str, pa.Array]
+    cells: Mapping[str, pa.ChunkedArray]
 
     def __len__(self) -> int:
         return len(next(iter(self.cells.values())))
@@ -79,8 +88,13 @@ class TextTable:
 
     def floats(self, *names: str) -> Floats:
         """One column (n,) or several (n, k) as numbers; empty cells become NaN."""
-        columns = [self._numbers(name, pa.float64()).to_numpy(zero_copy_only=False) for name in names]
-        return np.asarray(columns[0] if len(names) == 1 else np.stack(columns, axis=-1), dtype=np.float64)
+        rows = np.zeros((0, len(names)))
+        for column, name in enumerate(names):
+            numbers = self._numbers(name, pa.float64()).to_numpy()
+            if column == 0:
+                rows = np.empty((len(numbers), len(names)))
+            rows[:, column] = numbers
+        return rows if len(names) > 1 else rows[:, 0]
 
     def ints(self, name: str) -> Times:
         """One column as int64; every cell must hold a whole number."""
@@ -91,25 +105,30 @@ class TextTable:
 
     def times(self, name: str, unit_ns: int = NS) -> Times:
         """One column of decimal clock readings in units of `unit_ns` as exact nanoseconds."""
-        found = np.empty(len(self), dtype=np.int64)
-        for row, text in enumerate(self.cells[name].to_pylist()):
-            try:
-                found[row] = ns_from_text(text, unit_ns)
-            except SessionError as error:
-                raise self._bad_cell(name, row, "a decimal number") from error
+        cells = self.cells[name]
+        found = np.empty(len(cells), dtype=np.int64)
+        for first in range(0, len(cells), ROWS):
+            for row, text in enumerate(cells[first : first + ROWS].to_pylist(), first):
+                try:
+                    found[row] = ns_from_text(text, unit_ns)
+                except SessionError as error:
+                    raise self._bad_cell(name, row, "a decimal number") from error
         return found
 
     def is_empty(self, name: str) -> bool:
         """Whether no row of the column holds anything."""
-        return not any(self.cells[name].to_pylist())
+        return not pa.compute.any(pa.compute.not_equal(self.cells[name], "")).as_py()
 
-    def _numbers(self, name: str, kind: pa.DataType, what: str = "a number") -> pa.Array:
-        cells = self.cells[name]
-        filled = pa.compute.if_else(pa.compute.equal(cells, ""), pa.scalar(None, pa.string()), cells)
-        try:
+    def _numbers(self, name: str, kind: pa.DataType, what: str = "a number") -> pa.ChunkedArray:
+        def cast(cells: pa.Array) -> pa.Array:
+            filled = pa.compute.if_else(pa.compute.equal(cells, ""), pa.scalar(None, pa.string()), cells)
             return filled.cast(kind)
+
+        cells = self.cells[name]
+        try:
+            return pa.chunked_array([cast(chunk) for chunk in cells.chunks], kind)
         except pa.ArrowInvalid as error:
-            row = next(i for i, text in enumerate(filled.to_pylist()) if not _casts(text, kind))
+            row = next(i for i, text in enumerate(cells.to_pylist()) if text and not _casts(text, kind))
             raise self._bad_cell(name, row, what) from error
 
     def _bad_cell(self, name: str, row: int, expected: str) -> SessionError:
@@ -117,7 +136,7 @@ class TextTable:
         return SessionError(self.path, found, expected, "correct or delete the row", row=row)
 
 
-def _casts(text: str | None, kind: pa.DataType) -> bool:
+def _casts(text: str, kind: pa.DataType) -> bool:
     try:
         pa.scalar(text, pa.string()).cast(kind)
     except pa.ArrowInvalid:
@@ -141,47 +160,106 @@ def read_text(path: Path, *, names: Sequence[str] | None = None) -> TextTable:
     SessionError
         Missing, unreadable, no text, no rows, rows of different length, or a column name twice.
     """
-    heading, body = _split(path, with_heading=names is None)
-    first = heading if names is None else body[:4096].split(b"\n", 1)[0]
+    blocks = _blocks(path)
+    start = next(blocks, b"").removeprefix(b"\xef\xbb\xbf").lstrip()
+    if b"\0" in start[:4096]:
+        raise SessionError(path, "is no text (it holds zero bytes)", "a text file", "check the format")
+    heading = b""
+    if names is None:
+        heading, _, start = start.partition(b"\n")
+    start = _without_comments(start)
+    first = heading.strip() if names is None else start[:4096].split(b"\n", 1)[0]
     separator = next((mark for mark in ",;\t" if mark.encode() in first), " ")
-    columns = list(names) if names is not None else _heading_names(heading, separator)
+    columns = list(names) if names is not None else _heading_names(first, separator)
     if len(set(columns)) != len(columns):
         twice = sorted({name for name in columns if columns.count(name) > 1})
         raise SessionError(path, f"column {', '.join(map(repr, twice))} appears twice", "each column once")
-    if not body.strip():
+    more = next(blocks, b"")
+    if not start.strip() and not more:
         raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
-    if separator == " ":
-        body = re.sub(rb"[ \t]+", b" ", body)
-        body = re.sub(rb"(?m)^ | (?=\r?$)", b"", body)
-    return TextTable(path, _parse(path, body, columns, separator))
+    cells = _Cells(path, tuple(columns), separator, with_heading=names is None)
+    return TextTable(path, cells if more else cells.parse(columns, [start]))
 
 
-def _split(path: Path, *, with_heading: bool) -> tuple[bytes, bytes]:
-    data = read_bytes(path).removeprefix(b"\xef\xbb\xbf").lstrip()
-    if b"\0" in data[:4096]:
-        raise SessionError(path, "is no text (it holds zero bytes)", "a text file", "check the format")
-    heading = b""
-    if with_heading:
-        heading, _, data = data.partition(b"\n")
-    if b"#" in data:
-        data = re.sub(rb"(?m)^[ \t]*#.*\n?", b"", data)
-    return heading.strip(), data
+def _blocks(path: Path) -> Iterator[bytes]:
+    """The whole lines of a file, about `BLOCK` bytes at a time."""
+    rest: list[bytes] = []
+    for data in _chunks(path):
+        lines, end, begun = data.rpartition(b"\n")
+        if end:
+            yield b"".join([*rest, lines, end])
+            rest = []
+        rest.append(begun)
+    if last := b"".join(rest):
+        yield last
+
+
+def _without_comments(block: bytes) -> bytes:
+    return re.sub(rb"(?m)^[ \t]*#.*\n?", b"", block) if b"#" in block else block
+
+
+@dataclass(frozen=True)
+class _Cells(Mapping[str, "pa.ChunkedArray"]):
+    """The cells of a file by column, parsed from the file each time that a column is asked for."""
+
+    path: Path
+    columns: tuple[str, ...]
+    separator: str
+    with_heading: bool
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def __getitem__(self, name: str) -> pa.ChunkedArray:
+        if name not in self.columns:
+            raise KeyError(name)
+        pa.default_memory_pool().release_unused()  # what the column before took
+        return self.parse([name], self._blocks())[name]
+
+    def _blocks(self) -> Iterator[bytes]:
+        """The rows of the file, without byte order mark, heading and comments."""
+        blocks = _blocks(self.path)
+        start = next(blocks).removeprefix(b"\xef\xbb\xbf").lstrip()
+        yield _without_comments(start.partition(b"\n")[2] if self.with_heading else start)
+        yield from map(_without_comments, blocks)
+
+    def parse(self, names: Sequence[str], blocks: Iterable[bytes]) -> dict[str, pa.ChunkedArray]:
+        """The cells of the columns `names` in rows of text.
+
+        Raises
+        ------
+        SessionError
+            Rows of different length, or no UTF-8.
+        """
+        parts: list[pa.Table] = []
+        for block in blocks:
+            if self.separator == " ":
+                block = re.sub(rb"[ \t]+", b" ", block)
+                block = re.sub(rb"(?m)^ | (?=\r?$)", b"", block)
+            if block.strip():
+                parts.append(self._parse(names, block, sum(map(len, parts))))
+        table = pa.concat_tables(parts)
+        return {name: pa.compute.utf8_trim_whitespace(table.column(name)) for name in names}
+
+    def _parse(self, names: Sequence[str], block: bytes, before: int) -> pa.Table:
+        try:
+            return pyarrow.csv.read_csv(
+                pa.BufferReader(block),
+                read_options=pyarrow.csv.ReadOptions(column_names=self.columns, use_threads=False),
+                parse_options=pyarrow.csv.ParseOptions(delimiter=self.separator),
+                convert_options=pyarrow.csv.ConvertOptions(
+                    column_types=dict.fromkeys(names, pa.string()), include_columns=names
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            text = re.sub(r"Row #(\d+)", lambda row: f"Row #{int(row[1]) + before}", str(error))
+            found = f"is no table of {len(self.columns)} columns ({text})"
+            raise SessionError(self.path, found, "rows of one length") from error
 
 
 def _heading_names(heading: bytes, separator: str) -> list[str]:
     text = heading.decode("utf-8", errors="replace").lstrip("# ")
     return [name.strip().strip('"') for name in (text.split() if separator == " " else text.split(separator))]
-
-
-def _parse(path: Path, body: bytes, columns: list[str], separator: str) -> dict[str, pa.Array]:
-    try:
-        table = pyarrow.csv.read_csv(
-            io.BytesIO(body),
-            read_options=pyarrow.csv.ReadOptions(column_names=columns, use_threads=False),
-            parse_options=pyarrow.csv.ParseOptions(delimiter=separator),
-            convert_options=pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(columns, pa.string())),
-        )
-    except pa.ArrowInvalid as error:
-        raise SessionError(path, f"is no table of {len(columns)} columns ({error})", "rows of one length") from error
-    trim = pa.compute.utf8_trim_whitespace
-    return {name: trim(table.column(name).combine_chunks()) for name in columns}

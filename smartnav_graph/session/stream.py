@@ -86,7 +86,8 @@ class Stream:
 
     def _checked(self, spec: Field[object], value: ArrayLike) -> Column:
         names, kind = spec.metadata["columns"], spec.metadata["kind"]
-        array: Column = np.array(value, dtype=_DTYPES[kind])
+        owned = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
+        array: Column = np.array(value, dtype=_DTYPES[kind], copy=None if owned else True)
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
         if array.shape != shape:
             raise self._error(f"{spec.name} has shape {array.shape}", f"{shape}, one row per time stamp")
@@ -170,12 +171,24 @@ class Stream:
             known.update(found)
             if len(found) == len(names):
                 rows: list[Column] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
-                values[spec.name] = rows[0] if len(names) == 1 else np.stack(rows, axis=-1)
+                values[spec.name] = rows[0] if len(names) == 1 else _stacked(rows)
             elif found or spec.default is MISSING:
                 missing = [name for name in names if name not in table]
                 remedy = f"the file has {', '.join(table) or 'no columns'}; rename or add the column"
                 raise cls._error(f"column {', '.join(missing)} is missing", f"columns {', '.join(names)}", remedy)
         return cls(**values, extra={name: np.asarray(table[name]) for name in table if name not in known})
+
+
+def _stacked(columns: list[Column]) -> Column:
+    """Columns side by side (n, k), read-only; the array itself where they are the columns of a read-only one."""
+    whole = columns[0].base
+    if isinstance(whole, np.ndarray) and not whole.flags.writeable and whole.shape == (len(columns[0]), len(columns)):
+        starts = [column.__array_interface__["data"] for column in columns]
+        if starts == [column.__array_interface__["data"] for column in whole.T]:
+            return whole
+    rows = np.stack(columns, axis=-1)
+    rows.flags.writeable = False
+    return rows
 
 
 LLA = ("lat_deg", "lon_deg", "height_m")

@@ -1,9 +1,13 @@
 """Delimited text: exact stamps, exact numbers, errors that name file, row and value."""
 
+import gzip
+
 import numpy as np
 import pytest
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.readers import text as text_module
 from smartnav_graph.readers.text import read_text
 
 
@@ -108,3 +112,31 @@ def test_missing_file_and_folder(tmp_path):
         read_text(tmp_path / "no.csv")
     with pytest.raises(SessionError, match="cannot be read"):
         read_text(tmp_path)
+
+
+@pytest.mark.parametrize("separator", [",", " "])
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
+def test_a_long_file_is_read_block_by_block(tmp_path, monkeypatch, separator, name):
+    lines = ["t,v,note", *(f"{row}.25,{row * 0.5},n{row}" for row in range(100))]
+    lines.insert(40, "# remark, with comma")
+    text = ("\ufeff" + "\r\n".join(lines)).replace(",", separator).encode()
+    path = write(tmp_path, gzip.compress(text) if name.endswith(".gz") else text, name)
+    whole = read_text(path)
+    monkeypatch.setattr(text_module, "BLOCK", 64)  # two or three rows at once
+    table = read_text(path)
+    assert list(table.cells) == list(whole.cells) and len(table) == 100
+    assert table.times("t").tolist() == whole.times("t").tolist() == [row * NS + NS // 4 for row in range(100)]
+    np.testing.assert_array_equal(table.floats("v", "t"), whole.floats("v", "t"))
+    assert table.texts("note").tolist() == [f"n{row}" for row in range(100)]
+    assert not table.is_empty("note")
+
+
+def test_a_fault_far_down_a_long_file_has_its_row(tmp_path, monkeypatch):
+    monkeypatch.setattr(text_module, "BLOCK", 64)
+    rows = [f"{row},{row}" for row in range(100)]
+    table = read_text(write(tmp_path, "t,v\n" + "\n".join([*rows[:70], "70,x", *rows[71:]])))
+    with pytest.raises(SessionError, match=r"v is 'x' at row 70"):
+        table.floats("v")
+    short = read_text(write(tmp_path, "\n".join(["t,v", *rows[:70], "70", *rows[71:]]), "short.csv"))
+    with pytest.raises(SessionError, match=r"short.csv: is no table of 2 columns .*Row #71.*got 1: 70"):
+        short.floats("v")
