@@ -19,7 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
@@ -77,7 +76,7 @@ def _tables(path: Path) -> dict[str, TextTable]:
     for kind, found in rows.items():
         names = ("t", *(f"{kind} {axis}" for axis in VALUES[kind]))
         cells = zip(names, zip(*found, strict=True), strict=True)
-        tables[kind] = TextTable(path, {name: pa.array(column, pa.string()) for name, column in cells})
+        tables[kind] = TextTable.of(path, dict(cells))
     return tables
 
 

@@ -154,3 +154,27 @@ def test_a_reference_comes_along(tmp_path):
     (tmp_path / "imu.csv").write_text(IMU_ROWS)
     (tmp_path / "reference.csv").write_text("t_ns,e_m,n_m,u_m\n10,1,2,3\n")
     assert isinstance(readers.read(tmp_path).reference, Reference)
+
+
+@pytest.mark.parametrize(
+    ("heading", "stamps"),
+    [
+        ("t_s", ("1.5", "2.25")),
+        ("T_MS", ("1500", "2250")),
+        ("t_us", ("1500000", "2250000")),
+        ("t_ns", ("1.5e9", "2.25E9")),
+    ],
+)
+def test_stamps_in_other_units_and_capital_headings(tmp_path, heading, stamps):
+    names = f"{heading},GYRO_X_RAD_S,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2\n"
+    (tmp_path / "imu.csv").write_text(names + "".join(f"{stamp},0.1,0,0,0,0,9.81\n" for stamp in stamps) + "3")
+    session = readers.read(tmp_path)
+    assert session.imu.t_ns.tolist() == [1_500_000_000, 2_250_000_000] and session.imu.gyro[0, 0] == 0.1
+    assert session.dropped == {"imu": {"torn last rows": 1}}
+
+
+def test_dates_as_stamps(tmp_path):
+    names = "t_ns,lat_deg,lon_deg,height_m\n"
+    (tmp_path / "gnss.csv").write_text(names + "2023-12-31T22:33:02.4Z,48,11,500\n2023-12-31T22:33:03.4Z,48,11,500\n")
+    (tmp_path / "session.toml").write_text("[origin]\nlat_deg = 48.0\nlon_deg = 11.0\nheight_m = 500.0\n")
+    assert readers.read(tmp_path).gnss.t_ns[0] == 1704061982_400_000_000

@@ -71,10 +71,11 @@ def test_empty_cells_become_nan_but_no_integers(tmp_path):
     [
         (b"", ("has no rows",)),
         (b"t,x\n", ("has no rows", "expected at least one row")),
-        (b"t,x\n1,2\n3\n", ("no table of 2 columns", "Expected 2 columns, got 1: 3")),
+        (b"t,x\n1,2\n3\n", ("no table of 2 columns", "Expected 2 columns, got 1: 3", "complete the row")),
+        (b"t,x\n3\n1,2", ("no table of 2 columns", "Expected 2 columns, got 1: 3")),
+        (b"t,x\n1,5,2,5\n3,5,4,5\n", ("no table of 2 columns", "if commas are decimal marks, export with decimal")),
         (b"t,x,x\n1,2,3\n", ("column 'x' appears twice",)),
         (b"t,x\n1,\0\n", ("is no text",)),
-        (b"t,x\n1,\xff\xfe\n", ("no table of 2 columns", "invalid UTF8")),
     ],
 )
 def test_faulty_files(tmp_path, text, parts):
@@ -89,7 +90,7 @@ def test_faulty_files(tmp_path, text, parts):
     ("cell", "read", "expected"),
     [
         ("abc", "floats", "a number"),
-        ("1,5", "floats", "a number"),
+        ("1,5,5", "floats", "a number"),
         ("0x10", "floats", "a number"),
         ("1.5", "ints", "a whole number"),
         ("99999999999999999999", "ints", "a whole number"),
@@ -140,3 +141,68 @@ def test_a_fault_far_down_a_long_file_has_its_row(tmp_path, monkeypatch):
     short = read_text(write(tmp_path, "\n".join(["t,v", *rows[:70], "70", *rows[71:]]), "short.csv"))
     with pytest.raises(SessionError, match=r"short.csv: is no table of 2 columns .*Row #71.*got 1: 70"):
         short.floats("v")
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|"])
+def test_decimal_commas(tmp_path, separator):
+    rows = [("t", "a", "b"), ("1,5", "-2,25", "7"), ("2,5", "3,5E-1", "8")]
+    table = read_text(write(tmp_path, "\n".join(separator.join(row) for row in rows) + "\n"))
+    assert table.times("t").tolist() == [1_500_000_000, 2_500_000_000]
+    np.testing.assert_array_equal(table.floats("a", "b"), [[-2.25, 7], [0.35, 8]])
+
+
+def test_two_decimal_marks_are_refused(tmp_path):
+    table = read_text(write(tmp_path, "t;x\n1,234;0.5\n2,345;0.25\n"))
+    with pytest.raises(SessionError, match="t is '1,234' at row 0, but x has decimal points; expected one"):
+        table.floats("t")
+
+
+@pytest.mark.parametrize(
+    "before",
+    ["sep=,\n", "SEP=,\r\n", '"sep=,"\n', "sep=,,,,\n", ",,,\n", "\n\n", "# a remark\n", "\ufeffsep=,\n# a\n\n"],
+)
+def test_lines_before_the_heading(tmp_path, before):
+    table = read_text(write(tmp_path, before + "t,x\n1,2\n"))
+    assert list(table.cells) == ["t", "x"] and table.floats("x").tolist() == [2]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_encodings(tmp_path, encoding):
+    text = "t,Richtung (°),Feld (µT)\n1,2,3\n"
+    assert list(read_text(write(tmp_path, text.encode(encoding))).cells) == ["t", "Richtung (°)", "Feld (µT)"]
+
+
+def test_repeated_headings_and_a_torn_last_row_are_counted(tmp_path):
+    table = read_text(write(tmp_path, "t,x\n1,2\nt,x\n3,4\n5"))
+    assert table.floats("t").tolist() == [1, 3]
+    assert table.skipped == {"repeated headings": 1, "torn last rows": 1}
+    assert read_text(write(tmp_path, "t,x\n1,2\n3,4")).floats("x").tolist() == [2, 4]
+    cut = read_text(write(tmp_path, "t,x\n1,2\n3,4"), whole=True)
+    assert cut.floats("x").tolist() == [2] and cut.skipped == {"torn last rows": 1}
+
+
+def test_missing_values_and_unnamed_columns(tmp_path):
+    table = read_text(write(tmp_path, "t,x,\n1,N/A,\n2,NaN,\n3,null,\n4,--,\n5,1.5,\n"))
+    np.testing.assert_array_equal(table.floats("x"), [np.nan] * 4 + [1.5])
+    assert table.known("x").tolist() == [False] * 4 + [True]
+    assert list(read_text(write(tmp_path, "t,x\n1,2,\n3,4,\n")).cells) == ["t", "x", "column 3"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2023-12-31T22:33:02.400Z", 1704061982_400_000_000),
+        ("2023-12-31 23:33:02.4 +0100", 1704061982_400_000_000),
+        ("2023-12-31T17:03:02,400-05:30", 1704061982_400_000_000),
+        ("2018-08-03 20:47:12:853", 1533329232_853_000_000),
+        ("1970-01-01T00:00:00.000000001Z", 1),
+    ],
+)
+def test_dates_are_unix_nanoseconds(tmp_path, text, expected):
+    assert read_text(write(tmp_path, f"t;x\n{text};1\n")).times("t").tolist() == [expected]
+
+
+def test_a_date_among_dates_that_is_none(tmp_path):
+    table = read_text(write(tmp_path, "t;x\n2023-12-31T22:33:02Z;1\n2023-13-31T22:33:02Z;1\n"))
+    with pytest.raises(SessionError, match="'2023-13-31T22:33:02Z' at row 1; expected a date as in the first row"):
+        table.times("t")
