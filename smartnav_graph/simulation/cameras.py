@@ -34,6 +34,18 @@ Range = tuple[float, float]
 
 # Optical axes (x right, y down, z forward) of a camera that looks along +y of a body with z up.
 LOOKING_AHEAD = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+# The camera of the thesis' phone (3264 x 2448) read out at 640 x 480, and where it is in the phone.
+PHONE_CAMERA = Camera(
+    width=3264,
+    height=2448,
+    fx=2935.64,
+    fy=2944.08,
+    cx=1619.0,
+    cy=1234.0,
+    distortion=(0.228, -0.973, -2.32e-4, -1.29e-3, 0.951),
+    noise_px=0.7,
+).resized(640, 480)
+ON_PHONE = Mount(body_t=(0.02, 0.05, -0.01), body_R=LOOKING_AHEAD)
 # Times a rolling shutter's row is found again at the pose of its time: 1 rad/s and 30 ms move it by 1 % of itself.
 _ROW_PASSES = 3
 
@@ -42,19 +54,23 @@ _ROW_PASSES = 3
 class Faults:
     """Faults of features beside noise.
 
-    outliers : share of wrong ones, drawn anew for every pair or frame between the two; lost : share of a frame's
-    tracks that end in it; glitches : (s, px), in the frame next to that time every feature is off by so much in one
+    outliers : share of wrong ones, drawn anew for every pair or frame between the two; moving : share of a pair's
+    features on an object that moves, by `moving_px` all together; lost : share of a frame's tracks that end in it
+    glitches : (s, px), in the frame next to that time every feature is off by so much in one
     direction; blind : (start s, length s) without any features, as in the dark
     """
 
     outliers: Range = (0.0, 0.0)
+    moving: Range = (0.0, 0.0)
+    moving_px: Range = (5.0, 40.0)
     lost: float = 0.0
     glitches: tuple[tuple[float, float], ...] = ()
     blind: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.outliers[0] <= self.outliers[1] < 1.0 and 0.0 <= self.lost < 1.0):
-            raise ConfigError("camera", f"outliers {self.outliers}, lost {self.lost}", "shares from 0 to below 1")
+        shares = (*self.outliers, *self.moving, self.lost)
+        if not (0.0 <= min(shares) <= max(shares) < 1.0 and self.outliers[1] + self.moving[1] < 1.0):
+            raise ConfigError("camera", f"outliers, moving and lost {shares}", "shares from 0 to below 1")
 
 
 @dataclass(frozen=True)
@@ -259,7 +275,13 @@ def _pair(
     i, j, good = i[chosen], j[chosen], np.arange(count) >= wrong
     if (others := len(other.rows) - 1) > 0:
         j[:wrong] = (j[:wrong] + 1 + rng.integers(others, size=wrong)) % (others + 1)
-    return one.xy_px[i], other.xy_px[j], good
+    xy1 = other.xy_px[j]
+    if model.faults.moving[1] > 0.0:
+        moved = slice(wrong, wrong + round(float(rng.uniform(*model.faults.moving)) * count))
+        angle = rng.uniform(-0.2, 0.2) + np.pi * rng.integers(2)  # along the road, mostly sideways in the image
+        xy1[moved] += rng.uniform(*model.faults.moving_px) * np.array([np.cos(angle), np.sin(angle)])
+        good[moved] = False
+    return one.xy_px[i], xy1, good
 
 
 def _tracks(

@@ -15,7 +15,7 @@ _STEPS = (
     Sway(hertz=0.95, shift=(0.015, 0.0, 0.0), tilt=(0.03, 0.0, 0.04), phase=0.7),
 )
 # A car body on its springs at 15 m/s.
-_SPRINGS = (
+SPRINGS = (
     Sway(hertz=1.3, shift=(0.0, 0.0, 0.004), tilt=(0.0, 0.003, 0.0)),
     Sway(hertz=1.7, tilt=(0.0, 0.0, 0.003), phase=1.1),
     Sway(hertz=11.0, shift=(0.0, 0.0, 5e-5), phase=0.4),
@@ -59,7 +59,7 @@ def car(duration: float, rng: np.random.Generator, *, start_speed: float = 0.0) 
             legs += [Leg(4.0, 0.0), Leg(float(rng.uniform(5, 15)), 0.0), Leg(4.0, slow)]
         legs.append(Leg(6.0, slow, turn))
     way = Legs(legs, speed=start_speed, heading_deg=float(rng.uniform(0, 360)))
-    return Trajectory(way, sway=_SPRINGS, sway_speed=15.0)
+    return Trajectory(way, sway=SPRINGS, sway_speed=15.0)
 
 
 def slip(rng: np.random.Generator, sigma: float, axes: tuple[int, ...] = (0, 2)) -> tuple[Sway, ...]:
@@ -88,6 +88,14 @@ def trolley(rounds: int, *, rest: float = 60.0, stop: float = 10.0) -> Trajector
         legs += [*half, Leg(4.0, 1.0, 90.0), Leg(side / 2, 1.0), Leg(2.0, 0.0), Leg(stop, 0.0)]
     sway = (Sway(hertz=6.0, shift=(0.0, 0.0, 2e-4), tilt=(0.0, 0.001, 0.0)),)
     return Trajectory(Legs(legs, heading_deg=25.0), sway=sway)
+
+
+def arc_reach(speed: float, seconds: float) -> float:
+    """How far (m) a turn of 90 deg goes along the old direction, and as far along the new one: the integral of the
+    cosine."""
+    share = np.linspace(0.0, 1.0, 2001)
+    angle = np.pi / 2 * share**3 * (6.0 * share**2 - 15.0 * share + 10.0)
+    return float(np.trapezoid(np.cos(angle), share)) * speed * seconds
 
 
 # A trolley pushed over a floor: castors and joints, the rocking load, the steering hand, the steps of the person.
@@ -163,10 +171,8 @@ class Corridors:
 
     @property
     def _arc_m(self) -> float:
-        """How far along the corridor, and then along the next one, an arc goes: the integral of the cosine."""
-        share = np.linspace(0.0, 1.0, 2001)
-        angle = np.pi / 2 * share**3 * (6.0 * share**2 - 15.0 * share + 10.0)
-        return float(np.trapezoid(np.cos(angle), share)) * self.corner_m_s * self.turn_s
+        """How far along the corridor, and then along the next one, an arc goes."""
+        return arc_reach(self.corner_m_s, self.turn_s)
 
     def _drive(self, metres: float, begin: float, end: float) -> list[Leg]:
         v, ramps = self.speed_m_s, self.ramp_s * (self.speed_m_s + (begin + end) / 2)

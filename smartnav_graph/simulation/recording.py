@@ -34,7 +34,14 @@ from smartnav_graph.session.streams import ControlPoint, GnssFix, PoseFix, Range
 from smartnav_graph.simulation import cameras, fixes, render, sensors
 from smartnav_graph.simulation.cameras import SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
-from smartnav_graph.simulation.sensors import PROFILES, BarometerModel, Biases, MagnetometerModel, SpeedModel
+from smartnav_graph.simulation.sensors import (
+    PROFILES,
+    BarometerModel,
+    Biases,
+    MagnetometerModel,
+    SpeedModel,
+    TemperatureModel,
+)
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
 
 ORIGIN = Origin(52.0, 11.0, 100.0)
@@ -51,6 +58,8 @@ class Scenario:
     """A motion of `seconds` (the first samples of it), a device and its sensors; call it with a seed.
 
     rest_sigma_m_s : sigma of the velocity at the listed standstills
+    control_arm : from the body to the surveyed point under it, m in body axes; control_rest_s : shortest standstill
+    on a surveyed point
     """
 
     name: str
@@ -68,14 +77,18 @@ class Scenario:
     camera: SimulatedCamera | None = None
     ranges: RangeModel | None = None
     rest_sigma_m_s: float = 0.01
+    temperature: TemperatureModel | None = None
+    control_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    control_rest_s: float = 0.0
 
     def __call__(self, seed: int = 0, *, calibrated: bool = True) -> Session:
         motion, noise = _motion(self, seed), PROFILES[self.profile]
         gravity = frames.normal_gravity(ORIGIN.lat_deg, ORIGIN.height_m)
-        imu, biases = sensors.imu(motion.truth, motion.t_ns, noise, gravity, motion.rng("imu"))
+        warming = None if self.temperature is None else self.temperature.gyro_bias(motion.t)
+        imu, biases = sensors.imu(motion.truth, motion.t_ns, noise, gravity, motion.rng("imu"), warming)
         streams: dict[str, Stream | None] = {
             "gnss": _gnss(motion, self.gnss),
-            "control": _control(motion) if self.control else None,
+            "control": _control(motion, self) if self.control else None,
             "pose_fixes": _pose_fixes(motion, self.pose_fixes),
             "ranges": _ranges(motion, self.ranges),
             **_slow_sensors(motion, self),
@@ -84,6 +97,8 @@ class Scenario:
         rows = [np.arange(0, len(motion.t), SLOW_ROWS)]
         rows += [np.searchsorted(motion.t_ns, s.t_ns) for n, s in streams.items() if s is not None and n in _OWN_EPOCHS]
         mounts = {} if self.gnss is None else {"gnss": Mount(body_t=self.gnss.body_t_antenna)}
+        if any(self.control_arm):
+            mounts["control"] = Mount(body_t=self.control_arm)
         if self.ranges is not None:
             mounts["ranges"] = Mount(body_t=self.ranges.body_t_sensor)
         if self.camera is not None:
@@ -104,7 +119,7 @@ class Scenario:
 # Every purpose has separate random numbers: a new sensor is added at the end and does not change the others.
 PURPOSES = (
     *("motion", "imu", "gnss", "control", "magnetometer", "barometer", "wheel", "velocity", "pose_fixes"),
-    *("scene", "camera", "texture", "pictures", "ranges"),
+    *("scene", "camera", "texture", "pictures", "ranges", "temperature"),
 )
 
 
@@ -154,11 +169,14 @@ def _gnss(motion: _Motion, model: GnssModel | None) -> GnssFix | None:
     return fixes.gnss(truth, t_ns, model, motion.frame, motion.rng("gnss"))
 
 
-def _control(motion: _Motion) -> ControlPoint:
-    at = np.searchsorted(motion.t, [(start + end) / 2 for start, end in motion.rests])
+def _control(motion: _Motion, scenario: Scenario) -> ControlPoint:
+    long = [(start, end) for start, end in motion.rests if end - start >= scenario.control_rest_s]
+    at = np.searchsorted(motion.t, [(start + end) / 2 for start, end in long])
     names = [f"P{i}" for i in range(len(at))]
     rng = motion.rng("control")
-    return fixes.control(motion.truth.take(at), motion.t_ns[at], names, CONTROL_SIGMA_M, motion.frame, rng)
+    truth = motion.truth.take(at)
+    truth = replace(truth, nav_t_body=truth.nav_t_body + truth.nav_R_body @ np.asarray(scenario.control_arm))
+    return fixes.control(truth, motion.t_ns[at], names, CONTROL_SIGMA_M, motion.frame, rng)
 
 
 def _pose_fixes(motion: _Motion, model: PoseFixModel | None) -> PoseFix | None:
@@ -240,6 +258,9 @@ def _slow_sensors(motion: _Motion, scenario: Scenario) -> dict[str, Stream]:
         rows, rng = motion.rows(baro.rate_hz), motion.rng("barometer")
         height = ORIGIN.height_m + motion.truth.nav_t_body[rows, 2]
         made["barometer"] = sensors.barometer(height, motion.t_ns[rows], baro, rng)
+    if (warmth := scenario.temperature) is not None:
+        rows, rng = motion.rows(warmth.rate_hz), motion.rng("temperature")
+        made["temperature"] = sensors.thermometer(motion.t[rows], motion.t_ns[rows], warmth, rng)
     if (model := scenario.wheel) is not None:
         rows, rng = motion.rows(model.rate_hz), motion.rng("wheel")
         made["wheel"] = sensors.wheel(motion.trajectory.speed(motion.t[rows]), motion.t_ns[rows], model, rng)

@@ -18,10 +18,9 @@ from typing import TypedDict
 import numpy as np
 
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.session.calibration.camera import Camera
-from smartnav_graph.session.session import Mount, Session
-from smartnav_graph.simulation import motions
-from smartnav_graph.simulation.cameras import LOOKING_AHEAD, Faults, PictureModel, SimulatedCamera
+from smartnav_graph.session.session import Session
+from smartnav_graph.simulation import motions, thesis
+from smartnav_graph.simulation.cameras import ON_PHONE, PHONE_CAMERA, Faults, PictureModel, SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
 from smartnav_graph.simulation.recording import Scenario
 from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
@@ -72,22 +71,9 @@ _ALL_SENSORS: _Sensors = {
     "barometer": BarometerModel(walk_hpa=0.003),
 }
 
-# The thesis' phone camera (3264 x 2448) read out at 640 x 480.
-PHONE_CAMERA = Camera(
-    width=3264,
-    height=2448,
-    fx=2935.64,
-    fy=2944.08,
-    cx=1619.0,
-    cy=1234.0,
-    distortion=(0.228, -0.973, -2.32e-4, -1.29e-3, 0.951),
-    noise_px=0.7,
-).resized(640, 480)
-_ON_PHONE = Mount(body_t=(0.02, 0.05, -0.01), body_R=LOOKING_AHEAD)
-
 _ROOM = SimulatedCamera(
     camera=replace(PHONE_CAMERA, noise_px=0.5),
-    mount=_ON_PHONE,
+    mount=ON_PHONE,
     scene=FurnishedRoom(size_m=(8.0, 6.0, 3.0), centre_m=(-1.5, 0.4, 0.2)),
     rate_hz=10.0,
     count=(20, 60),
@@ -98,7 +84,7 @@ _RENDERED = replace(_ROOM, tracked=False, pictures=PictureModel())
 _TROLLEY = motions.Corridors()
 _CORRIDORS = SimulatedCamera(
     camera=PHONE_CAMERA,
-    mount=_ON_PHONE,
+    mount=ON_PHONE,
     scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
     rate_hz=1.25,
     range_m=(0.3, 40.0),
@@ -147,6 +133,7 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario(
             "trolley-20min", 1200.0, _TROLLEY, profile="galaxy-s2-warming", camera=_CORRIDORS, rest_sigma_m_s=5e-4
         ),
+        *thesis.SCENARIOS,
     )
 }
 

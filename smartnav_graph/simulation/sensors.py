@@ -18,7 +18,7 @@ from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
-from smartnav_graph.session.streams import Barometer, Imu, Magnetometer, Velocity, WheelSpeed
+from smartnav_graph.session.streams import Barometer, Imu, Magnetometer, Temperature, Velocity, WheelSpeed
 from smartnav_graph.simulation.trajectory import Truth
 
 
@@ -80,10 +80,16 @@ def random_walk(t_ns: Times, start_sigma: float, walk: float, rng: np.random.Gen
 
 
 def imu(
-    truth: Truth, t_ns: Times, noise: ImuNoise | None, gravity: float, rng: np.random.Generator
+    truth: Truth,
+    t_ns: Times,
+    noise: ImuNoise | None,
+    gravity: float,
+    rng: np.random.Generator,
+    warming: Floats | None = None,
 ) -> tuple[Imu, Biases]:
     """Inertial samples at the stamps `t_ns` of `truth`, and their true biases; `noise` None gives the exact ones.
 
+    warming : bias (n, 3) rad/s of the gyro by temperature, beside the random one
     White noise has sigma = density / sqrt(dt), dt the median interval. Earth rotation is not simulated.
     """
     accel, gyro = specific_force(truth, gravity), truth.body_rate
@@ -95,6 +101,8 @@ def imu(
         random_walk(t_ns, noise.accel_bias_sigma, noise.accel_bias_walk, rng),
         random_walk(t_ns, noise.gyro_bias_sigma, noise.gyro_bias_walk, rng),
     )
+    if warming is not None:
+        biases = replace(biases, gyro=biases.gyro + warming)
     accel = accel + biases.accel + noise.accel_noise_density * root_rate * rng.standard_normal(accel.shape)
     gyro = gyro + biases.gyro + noise.gyro_noise_density * root_rate * rng.standard_normal(gyro.shape)
     return Imu(t_ns=t_ns, gyro=gyro, accel=accel), biases
@@ -125,6 +133,31 @@ class BarometerModel:
 
 
 @dataclass(frozen=True)
+class TemperatureModel:
+    """A thermometer beside the inertial sensors at `rate_hz`, white sigma deg C, and what temperature does to the gyro.
+
+    A device warms up from `start_c` towards `end_c` with the time constant `warming_s`; the bias of the gyro is in
+    proportion to temperature, by `gyro_rad_s_k` (x, y, z) rad/s/K, and zero at `zero_c`.
+    """
+
+    rate_hz: float = 1.0
+    sigma_c: float = 0.05
+    start_c: float = 33.0
+    end_c: float = 48.0
+    warming_s: float = 4500.0
+    zero_c: float = 40.0
+    gyro_rad_s_k: tuple[float, float, float] = (2.0e-4, 0.85e-4, -6.1e-4)
+
+    def temperature(self, t: Floats) -> Floats:
+        """deg C at times t (n,) s."""
+        return np.asarray(self.end_c - (self.end_c - self.start_c) * np.exp(-t / self.warming_s))
+
+    def gyro_bias(self, t: Floats) -> Floats:
+        """(n, 3) rad/s at times t (n,) s."""
+        return np.outer(self.temperature(t) - self.zero_c, self.gyro_rad_s_k)
+
+
+@dataclass(frozen=True)
 class SpeedModel:
     """A wheel or velocity sensor: `rate_hz` and white sigma m/s (per axis)."""
 
@@ -145,6 +178,11 @@ def magnetometer(
         iron = size_ut[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
         field = field + rotate_back(truth.nav_R_body, iron)
     return Magnetometer(t_ns=t_ns, field_ut=field)
+
+
+def thermometer(t: Floats, t_ns: Times, model: TemperatureModel, rng: np.random.Generator) -> Temperature:
+    """Temperature at times t (n,) s + white noise."""
+    return Temperature(t_ns=t_ns, temperature_c=model.temperature(t) + model.sigma_c * rng.standard_normal(len(t)))
 
 
 def standard_pressure(height_m: Floats) -> Floats:
