@@ -69,7 +69,8 @@ class Faults:
 
     def __post_init__(self) -> None:
         shares = (*self.outliers, *self.moving, self.lost)
-        if not (0.0 <= min(shares) <= max(shares) < 1.0 and self.outliers[1] + self.moving[1] < 1.0):
+        ordered = self.outliers[0] <= self.outliers[1] and self.moving[0] <= self.moving[1]
+        if not (ordered and min(shares) >= 0.0 and max(*shares, self.outliers[1] + self.moving[1]) < 1.0):
             raise ConfigError("camera", f"outliers, moving and lost {shares}", "shares from 0 to below 1")
 
 
