@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ import tyro
 from smartnav_graph.cli.options import Command, Repairs, SourceName, Switch, Text, Writing, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign
 from smartnav_graph.session import folder as session_folder
 
@@ -33,27 +35,38 @@ class Formats(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Writing):
-    """Import a log of another program into a session folder: units and signs are converted, axes and clock are kept.
+    """Import logs of other programs into a session folder: units and signs are converted, axes and clock are kept.
+
+    Several files become one session: the inertial log, and positions, control points, images that belong to it.
 
     Example: smartnav import gtsam-kitti --out kitti
+    Example: smartnav import log.zip track.gpx points.csv --out walk
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A file, folder or archive, or gtsam-kitti, gtsam-euroc."""
+    source: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """Files, folders or archives, or gtsam-kitti, gtsam-euroc."""
     format: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
     """The format, if it is not recognised (see `smartnav formats`)."""
     repair: Repairs = None
     """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
+    shift: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE=S")] = ()
+    """Seconds to add to the stamps of a file whose clock cannot be tied to that of the inertial log; repeatable."""
 
     def run(self) -> None:
         from smartnav_graph import readers
+        from smartnav_graph.readers.join import join
 
         check_session_out(self.out, self.force)
+        ties: tuple[object, ...] = ()
         with progress(self.quiet) as show:
-            show(f"reading {self.source}", 0, 0)
-            session = readers.read(self.source, self.format, repairs(self.repair))
+            show(f"reading {', '.join(self.source)}", 0, 0)
+            if len(self.source) == 1:
+                session = readers.read(self.source[0], self.format, repairs(self.repair))
+            else:
+                joined = join(self.source, self.format, repairs(self.repair), assigned_seconds(self.shift))
+                session, ties = joined.session, joined.ties
             session_folder.save(session, self.out, force=self.force, progress=show)
-        print(session_text(session))
+        print("\n".join([session_text(session), *(f"clock: {tie}" for tie in ties)]))
         print(f"session: {self.out}")
 
 
@@ -174,6 +187,24 @@ class View(Command):
         from smartnav_graph.output.rerun_log import view
 
         view(self.paths, self.web)
+
+
+def assigned_seconds(texts: Sequence[str]) -> dict[str, float]:
+    """The seconds of ``FILE=S``, by file.
+
+    Raises
+    ------
+    ConfigError
+        A text of another form.
+    """
+    found = {}
+    for text in texts:
+        name, _, seconds = text.rpartition("=")
+        try:
+            found[name] = float(seconds)
+        except ValueError as error:
+            raise ConfigError("--shift", f"{text!r}", "FILE=SECONDS", "for example --shift track.gpx=-3600") from error
+    return found
 
 
 def check_session_out(path: Path, force: bool) -> None:

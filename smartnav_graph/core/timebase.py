@@ -164,6 +164,12 @@ def _joined(lines: Indices) -> list[tuple[int, int]]:
     return joined
 
 
+def gps_from_utc(t_ns: Times) -> Times:
+    """Nanoseconds since 1980-01-06 in GPS time of Unix nanoseconds (UTC); the inverse of `utc_from_gps`."""
+    leaps = np.searchsorted(np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64), t_ns, side="right")
+    return np.asarray(np.asarray(t_ns, dtype=np.int64) - _GPS_EPOCH_NS + leaps * NS)
+
+
 def utc_from_gps(t_ns: Times) -> Times:
     """Unix nanoseconds (UTC) of nanoseconds since 1980-01-06 in GPS time, leap seconds subtracted."""
     steps = np.array(_LEAP_DAYS, dtype="datetime64[ns]").astype(np.int64) + np.arange(1, len(_LEAP_DAYS) + 1) * 10**9

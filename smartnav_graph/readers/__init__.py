@@ -23,6 +23,7 @@ from smartnav_graph.readers import (
     tyrex,
 )
 from smartnav_graph.readers.archive import is_archive, unpacked
+from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
@@ -41,6 +42,11 @@ READERS: dict[str, Reader] = {
         kitti_odometry.READER,
         colmap.READER,
         csv_folder.READER,
+        nmea.READER,
+        gpx.READER,
+        rtklib.READER,
+        listed.FIXES,
+        listed.CONTROL,
     )
 }
 
@@ -81,6 +87,7 @@ def find(source: str | Path, name: str | None = None) -> Reader:
         raise SessionError(source, "does not exist", "a file, a folder, gtsam-kitti or gtsam-euroc", "check the path")
     if name is not None:
         return READERS[name]
+    found = [reader for reader in found if not reader.general] or found
     if len(found) > 1:
         several = ", ".join(reader.name for reader in found)
         raise SessionError(source, f"is recognised as {several}", "one format", "choose one with --format")

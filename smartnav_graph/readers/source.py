@@ -28,6 +28,7 @@ class Reader:
     recognised_by : how a source of this format is recognised, one line
     matches : cheap check of names and first lines; never raises for a source of another format
     read_source : the conversion itself, of a source and the names of repairs
+    general : gives way to every other format that recognises the source
     """
 
     name: str
@@ -35,6 +36,7 @@ class Reader:
     recognised_by: str
     matches: Callable[[str], bool]
     read_source: Callable[[str, tuple[str, ...]], Session]
+    general: bool = False
 
     def read(self, source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
         """The session of `source`.
@@ -50,6 +52,15 @@ class Reader:
             Missing or unreadable file, wrong or missing column, a cell that is no number, faulty rows.
         """
         return self.read_source(str(source), tuple(repairs))
+
+
+def first_bytes(source: str, count: int = 8192) -> bytes:
+    """The first bytes of a file; none where there is no such file."""
+    try:
+        with open(source, "rb") as file:
+            return file.read(count)
+    except (OSError, ValueError):  # ValueError: a zero byte in the name
+        return b""
 
 
 def vector_columns(template: str, rows: Floats, axes: str = "xyz") -> Table:

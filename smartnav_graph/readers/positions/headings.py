@@ -1,0 +1,173 @@
+"""Columns of lists of positions, by their headings: what each is, in which unit, on which clock."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from smartnav_graph.core.arrays import Floats, Texts, Times
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import NS, ns_from_text
+from smartnav_graph.readers.source import first_bytes
+from smartnav_graph.readers.text import TextTable, read_text
+from smartnav_graph.readers.units import SPEED, plain, quantity_in, unit_in
+
+# What a column is -> headings, small letters and digits only.
+ROLES: dict[str, tuple[str, ...]] = {
+    "id": ("id", "pointid", "point", "name", "pointname", "nr", "no", "number", "station", "target", "punkt"),
+    "time": (
+        *("t", "time", "tns", "tms", "ts", "timestamp", "timens", "timems", "times", "datetime", "date", "utc"),
+        *("epoch", "unixtime", "utctime", "gpstime", "gpst", "timeutc", "timestampns", "timestampms", "timestamps"),
+    ),
+    "start": ("start", "begin", "from", "starttime", "tstart", "tstartns", "timestart", "startns"),
+    "end": ("end", "to", "stop", "endtime", "tend", "tendns", "timeend", "endns"),
+    "east": ("e", "east", "easting", "x", "em", "xm", "eastingm", "eastm", "rechtswert"),
+    "north": ("n", "north", "northing", "y", "nm", "ym", "northingm", "northm", "hochwert"),
+    "up": (
+        *("h", "height", "u", "up", "z", "um", "zm", "heightm", "elevation", "ele", "altitude", "alt", "altitudem"),
+        *("hell", "heightellipsoidal", "ellipsoidalheight", "altitudewgs84", "elevationm"),
+    ),
+    "msl": ("hmsl", "heightmsl", "mslheight", "altitudemsl", "horth", "orthometricheight", "normalheight"),
+    "geoid": ("geoid", "geoidm", "undulation", "geoidheight", "geoidseparation"),
+    "lat": ("lat", "latitude", "latdeg", "latitudedeg"),
+    "lon": ("lon", "lng", "long", "longitude", "londeg", "longitudedeg"),
+    "epsg": ("epsg", "epsgcode", "crs", "srid"),
+    "sigma": ("sigma", "sigmam", "sigmah", "sigmahm", "accuracy", "horizontalaccuracy", "accuracym", "hacc", "sd"),
+    "sigma_u": ("sigmau", "sigmaum", "sigmav", "sigmavm", "sigmaz", "sdu", "sdz", "verticalaccuracy", "vacc"),
+    "sigma_e": ("sigmae", "sigmaem", "sigmax", "sde", "sdx"),
+    "sigma_n": ("sigman", "sigmanm", "sigmay", "sdn", "sdy"),
+    "speed": ("speed", "speedms", "velocity", "groundspeed", "speedmps", *SPEED, "speedkmh", "speedmph", "speedknots"),
+    "course": ("course", "bearing", "heading", "direction", "track", "coursedeg", "bearingdeg", "cog"),
+    "sensor": ("sensor", "instrument", "prism"),
+}
+_INERTIAL = re.compile(r"acc|gyr|force|omega|^[aw][xyz]$|imu|rotation")
+_ROLE_OF = {name: role for role, names in ROLES.items() for name in names}
+_DATE = re.compile(
+    r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T ]\s*(\d\d?):(\d\d):(\d\d(?:\.\d*)?)\s*(Z|UTC|[+-]\d\d:?\d\d|)", re.IGNORECASE
+)
+# Numbers of at least so much are a clock since 1970 (1973 on), in this unit of ns.
+_UNIX = ((1e17, 1), (1e14, 1000), (1e11, 10**6), (1e8, NS))
+
+
+@dataclass(frozen=True)
+class PositionTable:
+    """A text file and which of its columns is what: role -> heading."""
+
+    table: TextTable
+    columns: dict[str, str]
+
+    @property
+    def path(self) -> Path:
+        return self.table.path
+
+    def floats(self, role: str) -> Floats | None:
+        """Numbers (n,) of a column; None where there is no such column."""
+        return self.table.floats(self.columns[role]) if role in self.columns else None
+
+    def texts(self, role: str) -> Texts | None:
+        """Texts (n,) of a column; None where there is no such column."""
+        return self.table.texts(self.columns[role]) if role in self.columns else None
+
+    def stamps(self, role: str) -> tuple[Times, str]:
+        """Stamps (n,) ns of a column and the epoch of their clock."""
+        name = self.columns[role]
+        return stamps(self.path, name, list(map(str, self.table.texts(name))))
+
+    def speed(self) -> Floats | None:
+        """Speed (n,) m/s by the unit that its heading names, m/s where it names none."""
+        values = self.floats("speed")
+        if values is None:
+            return None
+        name = plain(self.columns["speed"]).replace("_", "")
+        unit = unit_in(self.columns["speed"]) or next((unit for unit in SPEED if name.endswith(unit)), "m/s")
+        return values * SPEED.get(unit, 1.0)
+
+
+def roles_in(headings: list[str]) -> dict[str, str]:
+    """Role -> the first heading that has it."""
+    found: dict[str, str] = {}
+    for heading in headings:
+        role = _ROLE_OF.get(quantity_in(heading))
+        if role is not None:
+            found.setdefault(role, heading)
+    return found
+
+
+def heading_of(source: str) -> list[str]:
+    """The cells of the first line of a text file that is no comment; none where it is no text."""
+    data = first_bytes(source)
+    if b"\0" in data:
+        return []
+    lines = data.decode("utf-8-sig", errors="replace").splitlines()
+    line = next((text for text in lines if text.strip() and not text.startswith(("#", "%", "sep="))), "")
+    separator = next((mark for mark in ";\t," if mark in line), None)
+    return [cell.strip().strip('"') for cell in line.split(separator)]
+
+
+def has_positions(headings: list[str]) -> bool:
+    """Whether the headings are those of places and of nothing that measures motion."""
+    roles = roles_in(headings)
+    placed = {"lat", "lon"} <= roles.keys() or {"east", "north"} <= roles.keys()
+    return placed and not any(_INERTIAL.search(quantity_in(name)) for name in headings)
+
+
+def read_positions(path: Path) -> PositionTable:
+    """The table of a text file with headings."""
+    table = read_text(path)
+    return PositionTable(table, roles_in(list(table.cells)))
+
+
+def stamps(path: Path, name: str, texts: list[str]) -> tuple[Times, str]:
+    """Stamps (n,) ns of clock readings, and their epoch.
+
+    Dates with a time zone, and numbers since 1970, are Unix time; dates without one are read as UTC, of a clock that is
+    ``unknown``, as are other numbers: seconds, or what the heading names (``t_ns``, ``time (ms)``).
+    """
+    first = next((text for text in texts if text), "")
+    if _DATE.fullmatch(first):
+        zones = [_date(path, name, row, text) for row, text in enumerate(texts)]
+        known = all(zone for _, zone in zones)
+        return np.array([t for t, _ in zones], dtype=np.int64), "unix" if known else "unknown"
+    try:
+        size = abs(float(first))
+    except ValueError as error:
+        expected = "seconds, nanoseconds or a date such as 2025-06-01T10:00:00Z"
+        raise SessionError(path, f"{name} is {first!r} at row 0", expected, "write the times so", row=0) from error
+    gps = quantity_in(name).startswith("gps")
+    since_1970 = next((unit for least, unit in _UNIX if size >= least), None)
+    unit = _unit_ns(name) or since_1970 or NS
+    found = np.empty(len(texts), dtype=np.int64)
+    for row, text in enumerate(texts):
+        try:
+            found[row] = ns_from_text(text, unit)
+        except SessionError as error:
+            raise SessionError(path, f"{name} is {text!r} at row {row}", "a number", "correct it", row=row) from error
+    return found, "unknown" if since_1970 is None else "gps" if gps else "unix"
+
+
+def _unit_ns(name: str) -> int | None:
+    """The unit that a heading names, such as ``t_ns`` or ``Time (ms)``."""
+    units = {"ns": 1, "us": 1000, "ms": 10**6, "s": NS}
+    found = unit_in(name) or (name.rpartition("_")[2].lower() if "_" in name else "")
+    return units.get(found)
+
+
+def _date(path: Path, name: str, row: int, text: str) -> tuple[int, bool]:
+    """Nanoseconds since 1970 of a date, and whether its time zone is known."""
+    match = _DATE.fullmatch(text.strip())
+    try:
+        if match is None:
+            raise ValueError("another form than in the first row")
+        year, month, day, hour, minute, second, zone = match.groups()
+        whole = np.datetime64(f"{year}-{int(month):02}-{int(day):02}T{int(hour):02}:{minute}:00", "ns")
+        t_ns = int(whole.astype(np.int64)) + ns_from_text(second)
+    except ValueError as error:
+        found = f"{name} is {text!r} at row {row} ({error})"
+        raise SessionError(path, found, "a date such as 2025-06-01T10:00:00Z", "correct it", row=row) from error
+    if zone[:1] in ("+", "-"):
+        minutes = 60 * int(zone[1:3]) + int(zone[-2:])
+        t_ns -= minutes * 60 * NS * (1 if zone[0] == "+" else -1)
+    return t_ns, bool(zone)
