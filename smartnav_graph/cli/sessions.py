@@ -39,7 +39,6 @@ class Import(Writing):
 
     Several files become one session: the inertial log, and positions, control points, images that belong to it.
 
-    Example: smartnav import gtsam-kitti --out kitti
     Example: smartnav import log.zip track.gpx points.csv --out walk
     """
 

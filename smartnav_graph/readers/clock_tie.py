@@ -71,7 +71,7 @@ def tie(base: Session, other: Session, source: str) -> Tie:
         shift = -round(lag.lag_s * NS)
         near = [way for way in ways if abs(way.shift_ns - shift) < _SAME_S * NS]
         if near:
-            best = min(near, key=lambda way: abs(way.shift_ns - shift))
+            best = min(near, key=lambda way: (way.by_zone, abs(way.shift_ns - shift)))
             return Tie(source, best.shift_ns, f"{best.how}, as the motion confirms")
         return Tie(source, shift, f"found by the motion of both, +- {lag.sigma_s:.2f} s")
     fitting = [way for way in ways if _common(base, other, way.shift_ns) >= _COMMON]

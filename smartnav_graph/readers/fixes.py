@@ -25,7 +25,8 @@ class LoggedFixes:
     t_ns : of the fix, on the clock of the session; lat, lon deg; height m
     horizontal, vertical : accuracies m, of 68 % radius and interval; a negative horizontal one marks a fix as invalid
     speed m/s, course deg clockwise from north, with their sigmas
-    velocity : (n, 3) m/s east, north, up, where the log has it instead of speed and course; sigma m/s
+    velocity : (n, 3) m/s east, north, up, where the log has it instead of speed and course; sigma (n,) or (n, 3) m/s
+    sigma : (n, 3) m east, north, up, where the log has it instead of accuracies; fix_type : quality of the receiver
     """
 
     t_ns: Times
@@ -40,6 +41,8 @@ class LoggedFixes:
     course_sigma: Floats | None = None
     velocity: Floats | None = None
     velocity_sigma: Floats | None = None
+    sigma: Floats | None = None
+    fix_type: Times | None = None
 
 
 def unmarked(values: Floats | None, rows: int) -> Floats:
@@ -58,15 +61,18 @@ def no_position(fixes: LoggedFixes) -> Mask:
     return np.asarray(outside | marked | invalid)
 
 
-def fix_table(fixes: LoggedFixes) -> tuple[Table, dict[str, int]]:
+def fix_table(fixes: LoggedFixes, *, may_repeat: bool = False) -> tuple[Table, dict[str, int]]:
     """Columns of the stream ``gnss``, and the counts of the rows left out.
 
     Rows come in order of time; one that repeats the stamp, or all values, of the row before is left out.
+    `may_repeat` : every row is a fix of its own, which at rest may be that before.
     """
     n = len(fixes.t_ns)
     height = np.full(n, np.nan) if fixes.height is None else np.where(fixes.height > -9000.0, fixes.height, np.nan)
     columns: Table = {"t_ns": fixes.t_ns, "lat_deg": fixes.lat, "lon_deg": fixes.lon, "height_m": height}
     columns |= _sigmas(fixes) | _velocities(fixes)
+    if fixes.fix_type is not None:
+        columns["fix_type"] = fixes.fix_type
     bad = no_position(fixes)
     kept = np.flatnonzero(~bad)
     kept = kept[np.argsort(fixes.t_ns[kept], kind="stable")]
@@ -74,6 +80,7 @@ def fix_table(fixes: LoggedFixes) -> tuple[Table, dict[str, int]]:
     t_ns = fixes.t_ns[kept]
     first = np.concatenate([[True], np.diff(t_ns) > 0])[: len(t_ns)]
     same = np.concatenate([[False], _repeats([np.asarray(c)[kept] for name, c in columns.items() if name != "t_ns"])])
+    same &= not may_repeat
     counts = {
         "without a position left out": int(bad.sum()),
         "disordered rows sorted": moved,
@@ -97,7 +104,8 @@ def _repeats(columns: list[Column]) -> Mask:
 def _sigmas(fixes: LoggedFixes) -> Table:
     n = len(fixes.t_ns)
     horizontal, vertical = unmarked(fixes.horizontal, n) / RADIUS_68, unmarked(fixes.vertical, n)
-    known = [np.where(sigma > 0.0, sigma, np.nan) for sigma in (horizontal, horizontal, vertical)]
+    axes = (horizontal, horizontal, vertical) if fixes.sigma is None else fixes.sigma.T
+    known = [np.where(sigma > 0.0, sigma, np.nan) for sigma in axes]
     if not np.isfinite(known[0]).any():
         return {}
     return {f"sigma_{axis}_m": sigma for axis, sigma in zip("enu", known, strict=True)}
@@ -108,7 +116,7 @@ def _velocities(fixes: LoggedFixes) -> Table:
     n = len(fixes.t_ns)
     if fixes.velocity is not None:
         rows = fixes.velocity
-        sigma = np.tile(unmarked(fixes.velocity_sigma, n)[:, None], (1, 3))
+        sigma = np.broadcast_to(unmarked(fixes.velocity_sigma, n).reshape(n, -1), (n, 3))
     elif fixes.speed is not None and fixes.course is not None:
         speed, course = unmarked(fixes.speed, n), np.radians(unmarked(fixes.course, n))
         course = np.where((speed == 0.0) & np.isnan(course), 0.0, course)

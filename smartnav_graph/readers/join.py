@@ -12,7 +12,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, find_gaps
-from smartnav_graph.readers import read
+from smartnav_graph.readers import load, read
 from smartnav_graph.readers.clock_tie import Tie, span, tie
 from smartnav_graph.readers.positions.listed import SurveyedPoints, is_control, read_points
 from smartnav_graph.readers.positions.places import fitting_systems
@@ -64,7 +64,11 @@ def join(
     of_points = [source for source in sources if name in (None, "control") and is_control(source)]
     lists = {source: read_points(Path(source)) for source in of_points}
     untimed = {source: points for source, points in lists.items() if points.t_ns is None}
-    parts = {source: read(source, name, repairs) for source in sources if source not in untimed}
+    parts = {
+        source: load(source, repairs=repairs) if name is None else read(source, name, repairs)
+        for source in sources
+        if source not in untimed
+    }
     inertial = [source for source, part in parts.items() if part.imu is not None]
     if len(inertial) != 1:
         found = "no inertial data" if not inertial else f"inertial data in {', '.join(inertial)}"

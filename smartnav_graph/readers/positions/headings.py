@@ -13,7 +13,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_text
 from smartnav_graph.readers.source import first_bytes
 from smartnav_graph.readers.text import TextTable, read_text
-from smartnav_graph.readers.units import SPEED, plain, quantity_in, unit_in
+from smartnav_graph.readers.units import SPEED, plain_heading, quantity_in, unit_in
 
 # What a column is -> headings, small letters and digits only.
 ROLES: dict[str, tuple[str, ...]] = {
@@ -43,7 +43,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "course": ("course", "bearing", "heading", "direction", "track", "coursedeg", "bearingdeg", "cog"),
     "sensor": ("sensor", "instrument", "prism"),
 }
-_INERTIAL = re.compile(r"acc|gyr|force|omega|^[aw][xyz]$|imu|rotation")
+_INERTIAL = re.compile(r"accel|acc[xyz]|gyr|force|omega|^[aw][xyz]$|imu|rotation")
 _ROLE_OF = {name: role for role, names in ROLES.items() for name in names}
 _DATE = re.compile(
     r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T ]\s*(\d\d?):(\d\d):(\d\d(?:\.\d*)?)\s*(Z|UTC|[+-]\d\d:?\d\d|)", re.IGNORECASE
@@ -81,7 +81,7 @@ class PositionTable:
         values = self.floats("speed")
         if values is None:
             return None
-        name = plain(self.columns["speed"]).replace("_", "")
+        name = plain_heading(self.columns["speed"]).replace("_", "")
         unit = unit_in(self.columns["speed"]) or next((unit for unit in SPEED if name.endswith(unit)), "m/s")
         return values * SPEED.get(unit, 1.0)
 
@@ -115,8 +115,11 @@ def has_positions(headings: list[str]) -> bool:
 
 
 def read_positions(path: Path) -> PositionTable:
-    """The table of a text file with headings."""
-    table = read_text(path)
+    """The table of a text file with headings, which may follow comments."""
+    rows = read_text(path, names=heading_of(str(path)))
+    table = TextTable(path, {name: cells.slice(1) for name, cells in rows.cells.items()})  # below the headings
+    if not len(table):
+        raise SessionError(path, "has no rows", "at least one row", "add rows below the headings")
     return PositionTable(table, roles_in(list(table.cells)))
 
 

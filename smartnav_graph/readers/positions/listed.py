@@ -26,7 +26,7 @@ from smartnav_graph.readers.positions.headings import (
 from smartnav_graph.readers.positions.places import geodetic
 from smartnav_graph.readers.positions.track import session_of_fixes
 from smartnav_graph.readers.source import Reader, build_session, first_bytes, vector_columns
-from smartnav_graph.readers.units import plain
+from smartnav_graph.readers.units import plain_heading
 from smartnav_graph.session.session import Mount, Session
 
 _EPSG = re.compile(rb"(?m)^[#%].*?EPSG\W{0,3}(\d{4,5})", re.IGNORECASE)
@@ -93,7 +93,9 @@ def is_fixes(source: str) -> bool:
     headings = heading_of(source)
     roles = roles_in(headings)
     # x, y, z alone may be anything, such as the axes of a sensor
-    placed = {"lat", "lon"} <= roles.keys() or "epsg" in roles or plain(roles.get("east", "x")) not in ("x", "x_m")
+    placed = (
+        {"lat", "lon"} <= roles.keys() or "epsg" in roles or plain_heading(roles.get("east", "x")) not in ("x", "x_m")
+    )
     return has_positions(headings) and placed and "time" in roles and not is_control(source)
 
 

@@ -88,7 +88,8 @@ def _places(path: Path, cells: dict[str, Floats], data: bytes) -> Floats:
         return rows
     import pyproj
 
-    lon, lat, height = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*rows.T)
+    to_lla = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    lon, lat, height = to_lla.transform(rows[:, 0], rows[:, 1], rows[:, 2])
     return np.stack([lat, lon, height], axis=1)
 
 

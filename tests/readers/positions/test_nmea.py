@@ -62,7 +62,7 @@ def test_invalid_fixes_and_broken_sentences_are_counted(tmp_path):
     broken = gga("235959.00").replace("5230", "5231")
     lines = ["NMEA," + rmc("235958.00") + ",1748822398000", broken, gga("000000.00", quality=0), "$GPGGA,torn"]
     counts = read(tmp_path, *lines).dropped["gnss"]
-    assert counts["sentences with a wrong checksum or field"] == 1 and counts["epochs without a fix"] == 2
+    assert counts["sentences with a wrong checksum or field"] == 2 and counts["epochs without a fix"] == 1
 
 
 def test_no_fix_at_all(tmp_path):

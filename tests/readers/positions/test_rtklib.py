@@ -8,7 +8,9 @@ from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, utc_from_gps
 
-COLUMNS = "latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio"
+COLUMNS = (
+    "latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s) ratio"
+)
 VALUES = "  52.500000000   11.500000000   100.2500   1  12   0.0110   0.0120   0.0250   0.001  0.001  0.001  0.00  3.2"
 NOON = int(np.datetime64("2025-06-01T12:00:00", "ns").astype(np.int64))
 
