@@ -44,7 +44,7 @@ class _Way:
     by_zone: bool = False  # one of many time zones
 
 
-def span(session: Session) -> tuple[int, int]:
+def time_span(session: Session) -> tuple[int, int]:
     """First and last stamp of all streams."""
     stamps = [stream.t_ns for stream in session.streams().values() if len(stream)]
     return min(int(t[0]) for t in stamps), max(int(t[-1]) for t in stamps)
@@ -83,7 +83,7 @@ def tie(base: Session, other: Session, source: str) -> Tie:
 
 def _ways(base: Session, other: Session) -> Iterator[_Way]:
     """Shifts that the clocks themselves explain, the plainest first."""
-    begin, first = span(base)[0], span(other)[0]
+    begin, first = time_span(base)[0], time_span(other)[0]
     if base.clock_epoch in _DATED and other.clock_epoch in _DATED:
         dated = _between_epochs(base.clock_epoch, other.clock_epoch, first)
         how = "both have one clock" if not dated else f"{other.clock_epoch} time against {base.clock_epoch} time"
@@ -129,7 +129,7 @@ def _weeks(dated_ns: int, week_ns: int, epoch: str, sign: int) -> Iterator[_Way]
 
 def _common(base: Session, other: Session, shift: int) -> float:
     """Share of the shorter recording that both cover; 1 for a single epoch inside."""
-    (a, b), (c, d) = span(base), span(other)
+    (a, b), (c, d) = time_span(base), time_span(other)
     overlap = min(b, d + shift) - max(a, c + shift)
     shorter = min(b - a, d - c)
     return float(overlap >= 0) if shorter == 0 else max(0.0, overlap / shorter)
@@ -147,7 +147,7 @@ def _by_motion(base: Session, other: Session) -> ClockOffset | None:
 
 
 def _not_tied(base: Session, other: Session, source: str, fitting: list[_Way]) -> SessionError:
-    (a, b), (c, d) = span(base), span(other)
+    (a, b), (c, d) = time_span(base), time_span(other)
     found = f"runs from {_moment(c, other)} to {_moment(d, other)}, the inertial log from {_moment(a, base)} to "
     found += f"{_moment(b, base)}, and the motion does not tie the clocks"
     if fitting:

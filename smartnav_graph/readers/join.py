@@ -13,7 +13,7 @@ from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, find_gaps
 from smartnav_graph.readers import load, read
-from smartnav_graph.readers.clock_tie import Tie, span, tie
+from smartnav_graph.readers.clock_tie import Tie, tie
 from smartnav_graph.readers.positions.listed import SurveyedPoints, is_control, read_points
 from smartnav_graph.readers.positions.places import fitting_systems
 from smartnav_graph.session.calibration.model import Calibration
@@ -239,4 +239,4 @@ def _check_places(session: Session, points: SurveyedPoints) -> None:
     raise SessionError(points.path, found, "the place of the recording", remedy, row=0)
 
 
-__all__ = ["Joined", "Tie", "join", "shifted", "span"]
+__all__ = ["Joined", "Tie", "join", "shifted"]

@@ -244,8 +244,8 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
         ("simulate wolk --out new", "simulate: scenario 'wolk'; expected one of walk-60s"),
         ("import eight/imu.parquet --out new", "eight/imu.parquet: is of no known format"),
         (
-            "import gtsam-kitti --out new --format rinex",
-            "--format: unknown format 'rinex'; expected one of gtsam-kitti",
+            "import gtsam-kitti --out new --format xyz",
+            "--format: unknown format 'xyz'; expected one of gtsam-kitti",
         ),
         ("import gtsam-kitti --out new --repair iron", "--repair: unknown repair iron; expected some of nan"),
         ("info nowhere", "nowhere: does not exist"),

@@ -11,7 +11,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_text
-from smartnav_graph.readers.source import first_bytes
+from smartnav_graph.readers.stamps import has_zone, is_date, ns_from_date
 from smartnav_graph.readers.text import TextTable, read_text
 from smartnav_graph.readers.units import SPEED, plain_heading, quantity_in, unit_in
 
@@ -43,11 +43,9 @@ ROLES: dict[str, tuple[str, ...]] = {
     "course": ("course", "bearing", "heading", "direction", "track", "coursedeg", "bearingdeg", "cog"),
     "sensor": ("sensor", "instrument", "prism"),
 }
+COMMENTS = "#%@"  # characters that start a line of remarks in a list of positions
 _INERTIAL = re.compile(r"accel|acc[xyz]|gyr|force|omega|^[aw][xyz]$|imu|rotation")
 _ROLE_OF = {name: role for role, names in ROLES.items() for name in names}
-_DATE = re.compile(
-    r"(\d{4})[-/.](\d\d?)[-/.](\d\d?)[T ]\s*(\d\d?):(\d\d):(\d\d(?:\.\d*)?)\s*(Z|UTC|[+-]\d\d:?\d\d|)", re.IGNORECASE
-)
 # Numbers of at least so much are a clock since 1970 (1973 on), in this unit of ns.
 _UNIX = ((1e17, 1), (1e14, 1000), (1e11, 10**6), (1e8, NS))
 
@@ -74,7 +72,7 @@ class PositionTable:
     def stamps(self, role: str) -> tuple[Times, str]:
         """Stamps (n,) ns of a column and the epoch of their clock."""
         name = self.columns[role]
-        return stamps(self.path, name, list(map(str, self.table.texts(name))))
+        return clock_readings(self.path, name, list(map(str, self.table.texts(name))))
 
     def speed(self) -> Floats | None:
         """Speed (n,) m/s by the unit that its heading names, m/s where it names none."""
@@ -96,17 +94,6 @@ def roles_in(headings: list[str]) -> dict[str, str]:
     return found
 
 
-def heading_of(source: str) -> list[str]:
-    """The cells of the first line of a text file that is no comment; none where it is no text."""
-    data = first_bytes(source)
-    if b"\0" in data:
-        return []
-    lines = data.decode("utf-8-sig", errors="replace").splitlines()
-    line = next((text for text in lines if text.strip() and not text.startswith(("#", "%", "sep="))), "")
-    separator = next((mark for mark in ";\t," if mark in line), None)
-    return [cell.strip().strip('"') for cell in line.split(separator)]
-
-
 def has_positions(headings: list[str]) -> bool:
     """Whether the headings are those of places and of nothing that measures motion."""
     roles = roles_in(headings)
@@ -116,24 +103,34 @@ def has_positions(headings: list[str]) -> bool:
 
 def read_positions(path: Path) -> PositionTable:
     """The table of a text file with headings, which may follow comments."""
-    rows = read_text(path, names=heading_of(str(path)))
-    table = TextTable(path, {name: cells.slice(1) for name, cells in rows.cells.items()})  # below the headings
-    if not len(table):
-        raise SessionError(path, "has no rows", "at least one row", "add rows below the headings")
+    table = read_text(path, comments=COMMENTS)
     return PositionTable(table, roles_in(list(table.cells)))
 
 
-def stamps(path: Path, name: str, texts: list[str]) -> tuple[Times, str]:
+def clock_readings(path: Path, name: str, texts: list[str]) -> tuple[Times, str]:
     """Stamps (n,) ns of clock readings, and their epoch.
 
     Dates with a time zone, and numbers since 1970, are Unix time; dates without one are read as UTC, of a clock that is
     ``unknown``, as are other numbers: seconds, or what the heading names (``t_ns``, ``time (ms)``).
     """
     first = next((text for text in texts if text), "")
-    if _DATE.fullmatch(first):
-        zones = [_date(path, name, row, text) for row, text in enumerate(texts)]
-        known = all(zone for _, zone in zones)
-        return np.array([t for t, _ in zones], dtype=np.int64), "unix" if known else "unknown"
+    dated = is_date(first)
+    if dated:
+        epoch, unit = "unix" if all(map(has_zone, texts)) else "unknown", NS
+    else:
+        epoch, unit = _clock(path, name, first)
+    found = np.empty(len(texts), dtype=np.int64)
+    for row, text in enumerate(texts):
+        try:
+            found[row] = ns_from_date(text) if dated else ns_from_text(text, unit)
+        except SessionError as error:
+            what = "a date as in the first row" if dated else "a number"
+            raise SessionError(path, f"{name} is {text!r} at row {row}", what, "correct it", row=row) from error
+    return found, epoch
+
+
+def _clock(path: Path, name: str, first: str) -> tuple[str, int]:
+    """Epoch and unit of ns of clock readings that are numbers, by their heading and the first of them."""
     try:
         size = abs(float(first))
     except ValueError as error:
@@ -142,13 +139,7 @@ def stamps(path: Path, name: str, texts: list[str]) -> tuple[Times, str]:
     gps = quantity_in(name).startswith("gps")
     since_1970 = next((unit for least, unit in _UNIX if size >= least), None)
     unit = _unit_ns(name) or since_1970 or NS
-    found = np.empty(len(texts), dtype=np.int64)
-    for row, text in enumerate(texts):
-        try:
-            found[row] = ns_from_text(text, unit)
-        except SessionError as error:
-            raise SessionError(path, f"{name} is {text!r} at row {row}", "a number", "correct it", row=row) from error
-    return found, "unknown" if since_1970 is None else "gps" if gps else "unix"
+    return "unknown" if since_1970 is None else "gps" if gps else "unix", unit
 
 
 def _unit_ns(name: str) -> int | None:
@@ -156,21 +147,3 @@ def _unit_ns(name: str) -> int | None:
     units = {"ns": 1, "us": 1000, "ms": 10**6, "s": NS}
     found = unit_in(name) or (name.rpartition("_")[2].lower() if "_" in name else "")
     return units.get(found)
-
-
-def _date(path: Path, name: str, row: int, text: str) -> tuple[int, bool]:
-    """Nanoseconds since 1970 of a date, and whether its time zone is known."""
-    match = _DATE.fullmatch(text.strip())
-    try:
-        if match is None:
-            raise ValueError("another form than in the first row")
-        year, month, day, hour, minute, second, zone = match.groups()
-        whole = np.datetime64(f"{year}-{int(month):02}-{int(day):02}T{int(hour):02}:{minute}:00", "ns")
-        t_ns = int(whole.astype(np.int64)) + ns_from_text(second)
-    except ValueError as error:
-        found = f"{name} is {text!r} at row {row} ({error})"
-        raise SessionError(path, found, "a date such as 2025-06-01T10:00:00Z", "correct it", row=row) from error
-    if zone[:1] in ("+", "-"):
-        minutes = 60 * int(zone[1:3]) + int(zone[-2:])
-        t_ns -= minutes * 60 * NS * (1 if zone[0] == "+" else -1)
-    return t_ns, bool(zone)

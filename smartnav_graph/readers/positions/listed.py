@@ -16,16 +16,17 @@ from smartnav_graph.core.arrays import Floats, Table, Texts, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix
 from smartnav_graph.readers.positions.headings import (
+    COMMENTS,
     PositionTable,
+    clock_readings,
     has_positions,
-    heading_of,
     read_positions,
     roles_in,
-    stamps,
 )
 from smartnav_graph.readers.positions.places import geodetic
 from smartnav_graph.readers.positions.track import session_of_fixes
 from smartnav_graph.readers.source import Reader, build_session, first_bytes, vector_columns
+from smartnav_graph.readers.text_lines import heading_of
 from smartnav_graph.readers.units import plain_heading
 from smartnav_graph.session.session import Mount, Session
 
@@ -83,14 +84,14 @@ class SurveyedPoints:
 
 def is_control(source: str) -> bool:
     """Whether a file is a list of control points."""
-    headings = heading_of(source)
+    headings = heading_of(Path(source), COMMENTS)
     roles = roles_in(headings)
     return has_positions(headings) and "id" in roles and not {"speed", "course"} & roles.keys()
 
 
 def is_fixes(source: str) -> bool:
     """Whether a file is a list of fixes with times."""
-    headings = heading_of(source)
+    headings = heading_of(Path(source), COMMENTS)
     roles = roles_in(headings)
     # x, y, z alone may be anything, such as the axes of a sensor
     placed = (
@@ -180,8 +181,8 @@ def _when(found: PositionTable) -> tuple[Times | None, Times | None, str]:
     name = found.columns["time"]
     texts = list(map(str, found.table.texts(name)))
     if all("/" in text and not re.match(r"\d{4}/\d", text) for text in texts):  # an interval of ISO 8601
-        start, epoch = stamps(found.path, name, [text.partition("/")[0] for text in texts])
-        end, _ = stamps(found.path, name, [text.partition("/")[2] for text in texts])
+        start, epoch = clock_readings(found.path, name, [text.partition("/")[0] for text in texts])
+        end, _ = clock_readings(found.path, name, [text.partition("/")[2] for text in texts])
         return start, end, epoch
     t_ns, epoch = found.stamps("time")
     return t_ns, None, epoch

@@ -8,7 +8,7 @@ import smartnav_graph as sn
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.readers.positions.headings import stamps
+from smartnav_graph.readers.positions.headings import clock_readings
 from smartnav_graph.readers.positions.listed import read_points
 
 NOON = int(np.datetime64("2025-06-01T12:00:00", "ns").astype(np.int64))
@@ -56,15 +56,15 @@ def test_projected_fixes(tmp_path):
     ],
 )
 def test_clock_readings(tmp_path, name, text, t_ns, epoch):
-    found, its_epoch = stamps(tmp_path, name, [text])
+    found, its_epoch = clock_readings(tmp_path, name, [text])
     assert (found.tolist(), its_epoch) == ([t_ns], epoch)
 
 
 def test_a_clock_reading_that_is_none(tmp_path):
     with pytest.raises(SessionError, match="t is 'noon' at row 0; expected seconds"):
-        stamps(tmp_path, "t", ["noon"])
+        clock_readings(tmp_path, "t", ["noon"])
     with pytest.raises(SessionError, match="t is 'x' at row 1; expected a number"):
-        stamps(tmp_path, "t", ["1.0", "x"])
+        clock_readings(tmp_path, "t", ["1.0", "x"])
 
 
 def test_control_points_are_where_pyproj_puts_them(tmp_path):
