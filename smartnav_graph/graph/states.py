@@ -84,6 +84,23 @@ def indices_of(names: NDArray[np.uint64]) -> NDArray[np.int64]:
     return (names & ((np.uint64(1) << _LETTER_AT) - np.uint64(1))).astype(np.int64)
 
 
+_DIMS = np.zeros(256, dtype=np.intp)
+_DIMS[[ord(letter) for letter in STATES]] = [kind.dim for kind in STATES.values()]
+
+
+def dims_of(names: NDArray[np.uint64]) -> NDArray[np.intp]:
+    """Dimension of the state behind each key."""
+    return np.asarray(_DIMS[letters_of(names)])
+
+
+def damping_scales(names: NDArray[np.uint64]) -> Floats:
+    """Damping scales of states, one behind the other; names : their keys, sorted."""
+    letters, counts = np.unique(letters_of(names), return_counts=True)
+    return np.concatenate(
+        [np.tile(STATES[chr(letter)].damping_scale, count) for letter, count in zip(letters, counts, strict=True)]
+    )
+
+
 @lru_cache(maxsize=1 << 18)
 def key(letter: str, index: int) -> int:
     """GTSAM key of a state."""

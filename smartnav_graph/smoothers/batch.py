@@ -20,7 +20,6 @@ from smartnav_graph.smoothers.estimate import (
     Posterior,
     chronological_order,
     copy_state,
-    eliminated,
     estimate_of,
     indeterminate,
     posterior,
@@ -219,7 +218,7 @@ class Batch:
         try:
             graph, solve = self._solved(self.solve)
             solved = time.perf_counter()
-            marginals = posterior(eliminated(graph, solve.values, self.updates), self.updates)
+            marginals = posterior(graph, solve.values, self.updates)
             estimate = estimate_of(self.updates, solve, marginals)
         except RuntimeError as error:
             raise indeterminate(error, self.updates, self.t0_ns) from error

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices
 from smartnav_graph.core.errors import SolverError
-from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, dims_of, key
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
+from smartnav_graph.smoothers.covariance import marginals
 from smartnav_graph.smoothers.minimise import Solve
 from smartnav_graph.smoothers.whole_graph import StackedFactors, WholeGraph, stacks_of
-
-Conditionals = Mapping[int, gtsam.GaussianConditional]
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,16 @@ class Posterior:
     """Marginals of a solved graph, on GTSAM's tangents (pose on the body side).
 
     joint : (n, 15, 15) of each keyframe; following : (n - 1, 15, 15) of each with the next; session : (d, d) by key
+    counts : rows of each factor of the graph; residual (r,), whitened, and fitted (r,), the diagonal of J P J^T, of all
+    rows; see `redundancy`
     """
 
     joint: Floats
     following: Floats
     session: Mapping[int, Floats]
+    counts: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    residual: Floats = field(default_factory=lambda: np.zeros(0))
+    fitted: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +104,12 @@ class Estimate:
 
     def stacks(self, sensor: str) -> list[StackedFactors]:
         """The blocks of one sensor, joined; see `StackedFactors.linearize` for their residuals."""
-        return self._stacks.get(sensor, [])
+        return [stack for stack in self.all_stacks if stack.sensor == sensor]
 
     @cached_property
-    def _stacks(self) -> Mapping[str, list[StackedFactors]]:
-        found: dict[str, list[StackedFactors]] = {}
-        for stack in stacks_of(self.blocks, self.held):
-            found.setdefault(stack.blocks[0].sensor, []).append(stack)
-        return found
+    def all_stacks(self) -> Sequence[StackedFactors]:
+        """The blocks of all sensors, joined, in the order of the graph."""
+        return stacks_of(self.blocks, self.held)
 
     @cached_property
     def _states(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -174,137 +177,52 @@ def chronological_order(updates: Sequence[GraphUpdate]) -> gtsam.Ordering:
     return gtsam.Ordering([*(name for update in updates for name in update.names()), *session_states(updates)])
 
 
-def eliminated(graph: WholeGraph, values: gtsam.Values, updates: Sequence[GraphUpdate]) -> gtsam.GaussianBayesNet:
-    """Bayes net of a graph linearised at `values`, in chronological order; QR is exact where states are weakly held."""
-    return graph.linearize(values).eliminateSequential(chronological_order(updates), gtsam.EliminateQR)
-
-
-def posterior(net: gtsam.GaussianBayesNet, updates: Sequence[GraphUpdate]) -> Posterior:
-    """Marginals of a Bayes net eliminated in chronological order, session states last; see `joint_covariances`.
+def posterior(graph: WholeGraph, values: gtsam.Values, updates: Sequence[GraphUpdate]) -> Posterior:
+    """Marginals of a graph linearised at `values`.
 
     Raises
     ------
     RuntimeError
-        A keyframe is not determined.
+        A state is not determined.
     """
-    groups, session = [update.names() for update in updates], list(session_states(updates))
-    joint, following = np.empty((len(updates), 15, 15)), np.empty((max(len(updates) - 1, 0), 15, 15))
-    later: dict[int, Floats] = {}
-    for row, found in joint_covariances(net, groups, session):
-        if row == len(updates):
-            later = {name: found.of([name]) for name in session}
-            continue
-        joint[row] = found.covariance[:15, :15]
-        if row < len(following):
-            at = found.at[groups[row + 1][0]].start
-            following[row] = found.covariance[:15, at : at + 15]
-    return Posterior(joint, following, later)
-
-
-def joint_covariances(
-    net: gtsam.GaussianBayesNet, groups: Sequence[Sequence[int]], session: Sequence[int]
-) -> Iterator[tuple[int, JointCovariance]]:
-    """Joint covariance of the session states (row n), then of each of the n groups of states, backwards in time, with
-    all later states that a factor shares with it.
-
-    Each keyframe is conditioned on what comes later, R x_k + S y = d; backwards in time P_k = R^-1 R^-T + K P_y K^T
-    and P_ky = -K P_y with K = R^-1 S. One small product a keyframe, and stable where nothing holds the trajectory (a
-    dead reckoning of minutes), where GTSAM's shortcuts of the Bayes tree give up.
-
-    Source: Rauch, Tung, Striebel (1965), in square-root information form (Bierman 1977, ch. X).
-
-    Parameters
-    ----------
-    groups : keys of the states of each keyframe, in the order of the elimination; session : those eliminated last
-    """
-    conditionals = {net.at(i).keys()[0]: net.at(i) for i in range(net.size())}
-    first_use = _earliest_users(groups, conditionals)
-    found = JointCovariance({}, np.zeros((0, 0)))
-    if session:
-        found = found.extended(session, conditionals)
-    yield len(groups), found
-    following: Sequence[int] = ()
-    for row in reversed(range(len(groups))):
-        kept = [name for name in found.at if name in following or first_use.get(name, row + 1) <= row]
-        found, following = found.only(kept).extended(groups[row], conditionals), groups[row]
-        yield row, found
+    linear, session = graph.linearize(values), session_states(updates)
+    counts = graph.row_counts(linear)
+    found = marginals(linear, [update.names() for update in updates], list(session), int(counts.sum()))
+    at = np.cumsum([0, *(len(state.initial) for state in session.values())])
+    blocks = [found.session[a:b, a:b] for a, b in pairwise(at.tolist())]
+    parts = dict(zip(session, blocks, strict=True))
+    return Posterior(found.joint, found.following, parts, counts, found.residual, found.fitted)
 
 
 def latest_covariance(net: gtsam.GaussianBayesNet, names: Sequence[int]) -> Floats:
-    """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents."""
-    conditionals, missing, place = {}, set(names), net.size()
+    """Joint covariance of the states that a Bayes net eliminates last, in the order of `names`, on GTSAM's tangents.
+
+    Raises
+    ------
+    RuntimeError
+        A state is not determined.
+    """
+    dims = dims_of(np.array(names, dtype=np.uint64))
+    ends = np.cumsum(dims)
+    at = {name: slice(end - dim, end) for name, dim, end in zip(names, dims.tolist(), ends.tolist(), strict=True)}
+    R, missing, place = np.zeros((ends[-1],) * 2), set(names), net.size()
     while missing:  # one that nothing connects with the rest may come before it
         place -= 1
         conditional = net.at(place)
-        conditionals[conditional.keys()[0]] = conditional
-        missing.discard(conditional.keys()[0])
-    return JointCovariance({}, np.zeros((0, 0))).extended(names, conditionals).covariance
-
-
-def _earliest_users(
-    groups: Sequence[Sequence[int]], conditionals: Mapping[int, gtsam.GaussianConditional]
-) -> dict[int, int]:
-    """The earliest group that is conditioned on each state."""
-    found: dict[int, int] = {}
-    for row, names in enumerate(groups):
-        for name in names:
-            for parent in conditionals[name].keys()[1:]:
-                found.setdefault(parent, row)
-    return found
-
-
-@dataclass(frozen=True)
-class JointCovariance:
-    """Joint covariance of some states, on GTSAM's tangents; at : rows of each state, by key."""
-
-    at: dict[int, slice]
-    covariance: Floats
-
-    def of(self, names: Sequence[int]) -> Floats:
-        """The covariance of the states `names`, in their order."""
-        columns = np.array([i for name in names for i in range(self.at[name].start, self.at[name].stop)], dtype=np.intp)
-        return np.asarray(self.covariance[columns[:, None], columns])
-
-    def only(self, names: Sequence[int]) -> JointCovariance:
-        """The same without all other states."""
-        return self if len(names) == len(self.at) else JointCovariance(_slices(names), self.of(names))
-
-    def extended(self, names: Sequence[int], conditionals: Conditionals) -> JointCovariance:
-        """With the states `names` before these, which they are conditioned on."""
-        at = _slices(names)
-        size = max(part.stop for part in at.values())
-        R, S = np.zeros((size, size)), np.zeros((size, len(self.covariance)))
-        for name, part in at.items():
-            conditional = conditionals[name]
-            own = conditional.R()
-            if own.shape != (part.stop - part.start,) * 2:
-                raise RuntimeError(f"(Symbol: {gtsam.Symbol(name).string()})")
-            R[part, part] = own
-            rest, column = conditional.S(), 0
-            for parent in conditional.keys()[1:]:
-                block = at.get(parent) or self.at[parent]
-                width = block.stop - block.start
-                (R if parent in at else S)[part, block] = rest[:, column : column + width]
-                column += width
-        if not np.isfinite(R).all() or (np.diag(R) == 0.0).any():
-            raise RuntimeError(f"(Symbol: {gtsam.Symbol(next(iter(at))).string()})")
-        inverse = np.linalg.inv(R)
-        gain = inverse @ S
-        cross = -gain @ self.covariance
-        own = inverse @ inverse.T - cross @ gain.T
-        joint = np.empty((size + len(self.covariance),) * 2)
-        joint[:size, :size], joint[:size, size:], joint[size:, :size] = own, cross, cross.T
-        joint[size:, size:] = self.covariance
-        return JointCovariance(_slices([*names, *self.at]), joint)
-
-
-def _slices(names: Iterable[int]) -> dict[int, slice]:
-    at, start = {}, 0
-    for name in names:
-        size = kind_of(name).dim
-        at[name] = slice(start, start + size)
-        start += size
-    return at
+        name, *parents = conditional.keys()
+        if name not in missing:
+            continue
+        missing.discard(name)
+        own, rest, column = conditional.R(), conditional.S(), 0
+        if len(own) < dims[names.index(name)] or not np.isfinite(own).all() or (np.diag(own) == 0.0).any():
+            raise RuntimeError(f"(Symbol: {gtsam.Symbol(name).string()})")
+        R[at[name], at[name]] = own
+        for parent in parents:
+            width = at[parent].stop - at[parent].start
+            R[at[name], at[parent]] = rest[:, column : column + width]
+            column += width
+    inverse = np.linalg.inv(R)
+    return np.asarray(inverse @ inverse.T)
 
 
 def session_values(

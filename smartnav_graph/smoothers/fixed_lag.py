@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, key, kind_of
+from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, damping_scales, key, kind_of
 from smartnav_graph.graph.update import FactorBatch, GraphUpdate
 from smartnav_graph.smoothers.estimate import copy_state, latest_covariance, state_at
 from smartnav_graph.smoothers.incremental import Effort, Incremental, ReplayConfig, scalars
@@ -61,7 +61,7 @@ class FixedLag(Incremental):
         graph = WholeGraph((f for _, f in self._factors), (b for _, b in self._blocks), self._held)
         order = self._order()
         names = list(self._live.keys())
-        damping_scale = np.concatenate([kind_of(name).damping_scale for name in names])
+        damping_scale = damping_scales(np.array(names, dtype=np.uint64))
         for count in range(1, MOST_ITERATIONS + 1):
             self._net = _eliminated(graph.linearize(self._live), order, self._weak)
             delta = self._net.optimize()

@@ -17,7 +17,6 @@ from smartnav_graph.graph.states import SessionState, State
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.smoothers.estimate import (
     Estimate,
-    eliminated,
     estimate_of,
     indeterminate,
     posterior,
@@ -126,7 +125,7 @@ class Incremental(ABC):
         if not updates:
             raise SolverError("replay", "no keyframe was processed", "at least one")
         graph, values = WholeGraph.of(updates), self.values()
-        marginals = posterior(eliminated(graph, values, updates), updates)
+        marginals = posterior(graph, values, updates)
         return estimate_of(updates, Solve(values, graph.error(values), len(updates), converged=True), marginals)
 
 

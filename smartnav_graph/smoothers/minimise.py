@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.core.errors import ConfigError, SolverError
-from smartnav_graph.graph.states import STATES, kind_of
+from smartnav_graph.graph.states import STATES, damping_scales, kind_of
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 
@@ -81,7 +81,7 @@ def minimise(
     cost = graph.error(values)
     if not np.isfinite(cost):
         raise SolverError("solve", f"cost {cost} at the start", "finite measurements and initial values")
-    damping_scale = np.concatenate([kind_of(name).damping_scale for name in list(values.keys())])
+    damping_scale = damping_scales(np.array(list(values.keys()), dtype=np.uint64))
     damping, iterations, converged, flat = 0.0, 0, False, 0
     recent = deque([cost], RECENT)
     while iterations < config.max_iterations and not converged:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.arrays import Floats, Indices
 from smartnav_graph.graph.robust import loss_weights, robust
 from smartnav_graph.graph.states import STATES, SessionState
 from smartnav_graph.graph.update import FactorBatch, GraphUpdate, Measured, RowModel
@@ -54,6 +54,7 @@ class StackedFactors:
 
     def __init__(self, model: RowModel, blocks: Sequence[FactorBatch], held: FixedStates) -> None:
         self.model, self.blocks, self.held = model, blocks, held
+        self.sensor = blocks[0].sensor
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
         self.loss_scale = np.repeat([block.loss_scale for block in blocks], [len(block.keys) for block in blocks])
@@ -168,6 +169,22 @@ class WholeGraph:
         for stack in self.stacks:
             stack.add_to(linear, snapshot)
         return linear
+
+    def row_counts(self, linear: gtsam.GaussianFactorGraph) -> Indices:
+        """Rows of each factor of `linear`, the linear system at some values."""
+        counts = [self._native_rows(i, linear) for i in range(self.native.size())]
+        for stack in self.stacks:
+            width = linear.at(len(counts)).jacobian()[1].size if stack.used.any() else 0
+            counts += [width] * int(stack.used.sum())
+        return np.array(counts, dtype=np.intp)
+
+    def _native_rows(self, place: int, linear: gtsam.GaussianFactorGraph) -> int:
+        """Those of smart factors depend on what was eliminated from them."""
+        factor = self.native.at(place)
+        if isinstance(factor, gtsam.NoiseModelFactor):
+            return int(factor.dim())
+        system = linear.at(place)
+        return 0 if system is None or system.empty() else int(system.jacobian()[1].size)
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of weighted squares."""

@@ -154,7 +154,7 @@ def residuals(solved: SolvedProblem) -> Residuals:
 def _of_stack(stack: StackedFactors, estimate: Estimate) -> Part:
     found = stack.measured(estimate.values)
     weight = np.where(found.used, found.weight, 0.0)
-    return stack.t_ns[found.row], stack.blocks[0].sensor, found.white, weight, found.used
+    return stack.t_ns[found.row], stack.sensor, found.white, weight, found.used
 
 
 def _of_late_rows(sensor: str, problem: Problem, estimate: Estimate) -> list[Part]:

@@ -43,7 +43,7 @@ from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.detect.scatter import Scatter
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.redundancy import FactorFit, factor_fits
+from smartnav_graph.smoothers.redundancy import factor_fits
 
 # No fix is believed better than this, metres: clocks and lever arms are not.
 LEAST_SIGMA = 0.03
@@ -93,9 +93,10 @@ def _update_noise_and_fixes(
     found = {name: pair for name, pair in found.items() if len(pair[1].rows)}
     new = pass_state
     exact = pass_state.stage == LAST_STAGE and pass_state.phase in (Phase.PLAIN, Phase.GATED)
-    fits = factor_fits(estimate) if exact else ()
+    fits = factor_fits(estimate) if exact else None
     for builder, residuals in found.values():
-        new = _rescaled(builder, with_fits(residuals, builder.name, fits), new)
+        fitted = None if fits is None else fits.of(builder.name, residuals.rows, 3)
+        new = _rescaled(builder, replace(residuals, fitted=fitted), new)
     tested = verdicts(builders, {name: residuals for name, (_, residuals) in found.items()}, estimate, new)
     worst = {v.name: v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested}
     if pass_state.phase is Phase.PLAIN and any(worst.values()):
@@ -271,10 +272,3 @@ def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, k
     if wanted > likely:
         wanted = float(np.sqrt((redundancy * wanted**2 + PRIOR_FIXES * likely**2) / (redundancy + PRIOR_FIXES)))
     return float(np.clip(wanted, max(least, LEAST_SIGMA), max(most, LEAST_SIGMA)))
-
-
-def with_fits(residuals: FixResiduals, sensor: str, fits: Iterable[FactorFit]) -> FixResiduals:
-    """The residuals with the share of each that the solution fits."""
-    by_row = {fit.factor.row: fit.fitted for fit in fits if fit.factor.sensor == sensor}
-    missing = np.full(3, np.nan)
-    return replace(residuals, fitted=np.array([by_row.get(int(row), missing) for row in residuals.rows]))

@@ -148,7 +148,7 @@ def _of_stack(stack: StackedFactors, values: gtsam.Values) -> Group:
     rows *= np.sqrt(stack.weight(residual))[:, None, None]
     keys = np.array(stack.keys, dtype=np.uint64)[:, free]
     used = stack.used
-    return Group(stack.blocks[0].sensor, stack.t_ns[used], stack.rows[used].astype(np.int64), keys[used], rows[used])
+    return Group(stack.sensor, stack.t_ns[used], stack.rows[used].astype(np.int64), keys[used], rows[used])
 
 
 def _priors(estimate: Estimate) -> Iterator[Group]:
