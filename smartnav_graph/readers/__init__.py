@@ -24,6 +24,7 @@ from smartnav_graph.readers import (
 )
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
+from smartnav_graph.readers.robotics import ros
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
@@ -47,6 +48,7 @@ READERS: dict[str, Reader] = {
         rtklib.READER,
         listed.FIXES,
         listed.CONTROL,
+        ros.READER,
     )
 }
 
@@ -123,8 +125,9 @@ def _without_pictures(found: Session) -> Session:
     folder = found.pictures
     files = [] if found.images is None or folder is None else [f for f in map(str, found.images.file) if f]
     lost = sum((folder / file).is_file() for file in files) if folder is not None else 0
+    lost += sum(map(bool, found.images.file)) if found.images is not None and found.write_pictures is not None else 0
     counts = {"images": {"pictures left in the archive (unpack it, and import the folder)": lost}} if lost else {}
-    return found.replace(pictures=None, dropped={**found.dropped, **counts})
+    return found.replace(pictures=None, write_pictures=None, dropped={**found.dropped, **counts})
 
 
 def _entry(folder: Path) -> Path:

@@ -36,6 +36,8 @@ def save(session: Session, path: str | Path, *, force: bool = False, progress: P
         if session.calibration is not None:
             (folder / "calibration.toml").write_text(calibration_toml(session.calibration), encoding="utf-8")
         _copy_pictures(session, folder / PICTURES, progress)
+        if session.write_pictures is not None:
+            session.write_pictures(folder / PICTURES)
         (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
 
 

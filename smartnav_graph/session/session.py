@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -71,7 +71,8 @@ class Session(Streams):
 
     `origin` may be absent (metric local positions only). `gravity_m_s2` overrides normal gravity. `repairs` names the
     repairs applied when the session is loaded; `dropped` counts what they touched. `pictures` is the folder that the
-    files of the images count from; saving copies those that are there.
+    files of the images count from; saving copies those that are there. Where pictures have to be decoded from a log,
+    `write_pictures` writes them into a folder; only saving does so.
     """
 
     device: Device = Device()
@@ -84,6 +85,7 @@ class Session(Streams):
     dropped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     path: Path | None = None
     pictures: Path | None = None
+    write_pictures: Callable[[Path], None] | None = None
 
     def __post_init__(self) -> None:
         if self.clock_epoch not in EPOCHS:

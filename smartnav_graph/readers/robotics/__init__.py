@@ -1,0 +1,1 @@
+"""Logs of robots, flight controllers and inertial navigation units."""
