@@ -51,21 +51,26 @@ class Import(Writing):
     shift: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE=S")] = ()
     """Seconds to add to the stamps of a file whose clock cannot be tied to that of the inertial log; repeatable."""
 
+    columns: Annotated[Text, tyro.conf.arg(metavar="NAME|DESCRIPTION")] = None
+    """Columns of a text file of no known format, such as "time=t_ms:ms, ax=accel_x:g, gx=gyro_x:deg/s ...", or the name
+    of a description that was kept."""
+    save_columns: Annotated[Text, tyro.conf.arg(metavar="NAME")] = None
+    """Keep the description of the columns under a name."""
+
     def run(self) -> None:
-        from smartnav_graph import readers
+        from smartnav_graph.readers.columns import parse_columns, save_profile
         from smartnav_graph.readers.join import join
 
         check_session_out(self.out, self.force)
-        ties: tuple[object, ...] = ()
         with progress(self.quiet) as show:
             show(f"reading {', '.join(self.source)}", 0, 0)
-            if len(self.source) == 1:
-                session = readers.read(self.source[0], self.format, repairs(self.repair))
-            else:
-                joined = join(self.source, self.format, repairs(self.repair), assigned_seconds(self.shift))
-                session, ties = joined.session, joined.ties
+            columns = None if self.columns is None else parse_columns(self.columns)
+            found = join(self.source, self.format, repairs(self.repair), assigned_seconds(self.shift), columns)
+            session, ties = found.session, found.ties
             session_folder.save(session, self.out, force=self.force, progress=show)
         print("\n".join([session_text(session), *(f"clock: {tie}" for tie in ties)]))
+        if self.columns is not None and self.save_columns is not None:
+            print(f"columns: {save_profile(self.save_columns, self.columns)}")
         print(f"session: {self.out}")
 
 

@@ -26,6 +26,7 @@ from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
 from smartnav_graph.readers.robotics import ros
 from smartnav_graph.readers.source import Reader
+from smartnav_graph.readers.unknown import describe_unknown
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.session import Session
 
@@ -94,8 +95,10 @@ def find(source: str | Path, name: str | None = None) -> Reader:
         several = ", ".join(reader.name for reader in found)
         raise SessionError(source, f"is recognised as {several}", "one format", "choose one with --format")
     if not found:
-        remedy = "see `smartnav formats`, or name it with --format"
-        raise SessionError(source, "is of no known format", f"one of {names}", remedy)
+        seen = describe_unknown(source)
+        fitting = f'describe its columns, such as --columns "{seen.columns}"; or ' if seen.columns else ""
+        remedy = f"{fitting}write CSV with the columns of `smartnav formats --columns`"
+        raise SessionError(source, f"is of no known format ({seen.one_line()})", f"one of {names}", remedy)
     return found[0]
 
 

@@ -14,6 +14,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, find_gaps
 from smartnav_graph.readers import load, read
 from smartnav_graph.readers.clock_tie import Tie, tie
+from smartnav_graph.readers.columns import ColumnMap, read_columns
 from smartnav_graph.readers.positions.listed import SurveyedPoints, is_control, read_points
 from smartnav_graph.readers.positions.places import fitting_systems
 from smartnav_graph.session.calibration.model import Calibration
@@ -42,8 +43,9 @@ def join(
     name: str | None = None,
     repairs: Iterable[str] = (),
     shifts: Mapping[str, float] | None = None,
+    columns: ColumnMap | None = None,
 ) -> Joined:
-    """One session of several sources, one of which has the inertial data.
+    """One session of one or several sources, one of which has the inertial data.
 
     Parameters
     ----------
@@ -51,6 +53,7 @@ def join(
     name : format of all sources; by default each is recognised
     repairs : as in `readers.read`
     shifts : seconds to add to the stamps of a source, instead of tying its clock
+    columns : description of the columns of those sources that no reader knows; see `columns`
 
     Raises
     ------
@@ -58,17 +61,23 @@ def join(
         A source cannot be read, its clock not be tied, two hold the same stream, or their places do not fit.
     """
     sources, repairs = list(sources), tuple(repairs)
+    files = [source for source in sources if columns is not None and columns.describes(source)]
+    described = {", ".join(files): read_columns(files, columns, repairs)} if columns is not None and files else {}
     unknown = sorted(set(shifts or {}) - {*sources, *(Path(source).name for source in sources)})
     if unknown:
         raise SessionError("--shift", f"names {unknown[0]!r}", f"one of {', '.join(sources)}", "name the file")
-    of_points = [source for source in sources if name in (None, "control") and is_control(source)]
+    others = [source for source in sources if source not in files]
+    of_points = [source for source in others if name in (None, "control") and is_control(source)]
     lists = {source: read_points(Path(source)) for source in of_points}
     untimed = {source: points for source, points in lists.items() if points.t_ns is None}
     parts = {
         source: load(source, repairs=repairs) if name is None else read(source, name, repairs)
         for source in sources
-        if source not in untimed
+        if source in others and source not in untimed
     }
+    parts |= described
+    if len(parts) == 1 and not untimed:
+        return Joined(next(iter(parts.values())), ())
     inertial = [source for source, part in parts.items() if part.imu is not None]
     if len(inertial) != 1:
         found = "no inertial data" if not inertial else f"inertial data in {', '.join(inertial)}"

@@ -119,7 +119,7 @@ def test_one_inertial_log(parts, tmp_path):
     log, fixes = parts
     source = fix_list(fixes, tmp_path / "fixes.csv")
     with pytest.raises(SessionError, match="no inertial data"):
-        join([source, source])
+        join([source, fix_list(fixes, tmp_path / "more.csv")])
     with pytest.raises(SessionError, match="inertial data in "):
         join([log, f"{log}/.", source])
 

@@ -137,9 +137,10 @@ def _clock(path: Path, name: str, first: str) -> tuple[str, int]:
         expected = "seconds, nanoseconds or a date such as 2025-06-01T10:00:00Z"
         raise SessionError(path, f"{name} is {first!r} at row 0", expected, "write the times so", row=0) from error
     gps = quantity_in(name).startswith("gps")
-    since_1970 = next((unit for least, unit in _UNIX if size >= least), None)
-    unit = _unit_ns(name) or since_1970 or NS
-    return "unknown" if since_1970 is None else "gps" if gps else "unix", unit
+    by_size = next((unit for least, unit in _UNIX if size >= least), None)
+    unit = _unit_ns(name) or by_size or NS
+    dated = size * unit >= _UNIX[0][0]
+    return ("gps" if gps else "unix") if dated else "unknown", unit
 
 
 def _unit_ns(name: str) -> int | None:

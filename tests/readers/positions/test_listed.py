@@ -49,6 +49,7 @@ def test_projected_fixes(tmp_path):
         ("time", "1748779200123", NOON + 123_000_000, "unix"),
         ("gps_time", "1432814418", 1_432_814_418 * NS, "gps"),
         ("time (ms)", "1500.5", 1_500_500_000, "unknown"),
+        ("t_ns", "5000000000000", 5_000_000_000_000, "unknown"),  # of a clock since the start of a phone
         ("t", "12.5", 12_500_000_000, "unknown"),
         ("time", "2025-06-01T12:00:00.5Z", NOON + NS // 2, "unix"),
         ("time", "2025/06/01 14:00:00+02:00", NOON, "unix"),
