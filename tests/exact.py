@@ -7,6 +7,7 @@ windows are interpolated.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -30,8 +31,8 @@ from smartnav_graph.session.streams import ControlPoint, GnssFix
 from smartnav_graph.simulation import motions, sensors
 from smartnav_graph.simulation.sensors import Biases
 from smartnav_graph.simulation.trajectory import Trajectory, Truth
-from smartnav_graph.smoothers.estimate import Estimate, Posterior
-from smartnav_graph.smoothers.whole_graph import custom_factor
+from smartnav_graph.smoothers.estimate import Estimate, Posterior, posterior
+from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
 
 GRAVITY = 9.81
 START_NS = 1_000 * NS
@@ -178,9 +179,13 @@ def values_of(states: Sequence[State]) -> Any:
 
 
 def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
-    """An estimate that stands at the graph's own values."""
+    """An estimate that stands at the graph's own values, with the fits of its factors where it is determined, but no
+    covariance."""
     n = len(graph.windows)
-    nothing = Posterior(np.zeros((n, 15, 15)), np.zeros((n - 1, 15, 15)), {})
+    marginals = Posterior(np.zeros((n, 15, 15)), np.zeros((n - 1, 15, 15)), {})
+    with suppress(RuntimeError):
+        found = posterior(WholeGraph.of(graph.updates), graph.values, graph.updates)
+        marginals = replace(marginals, counts=found.counts, residual=found.residual, fitted=found.fitted)
     return Estimate(
         values=graph.values,
         indices=range(n),
@@ -191,7 +196,7 @@ def estimate_of(graph: Graph, covariance: np.ndarray | None = None) -> Estimate:
         iterations=1,
         converged=True,
         cost=0.0,
-        marginals=nothing,
+        marginals=marginals,
     )
 
 
