@@ -24,6 +24,17 @@ from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
 
 SCHEMA = 1
+# Keys of session.toml and what they mean.
+HEADER_KEYS = {
+    "schema": "version of this format",
+    "device": "name, axes that point forward and up, what carries the device, whether it is mounted on a foot",
+    "clock": "`epoch` of t_ns: Unix, GPS (since 1980-01-06, no leap seconds), start of the device, or unknown",
+    "origin": "of the local frame, WGS84; without it positions are local e_m, n_m, u_m",
+    "gravity_m_s2": "magnitude of gravity, 9.0 to 10.5; by default normal gravity at the origin",
+    "sensors": "mount of each stream, camera, or instrument of a control point",
+    "calibration": "file with the calibration of the device, `calibration.toml`",
+    "repair": "repairs of faulty rows whenever the session is loaded",
+}
 PICTURES = "images"  # the folder of the pictures in that of the session
 
 
@@ -92,10 +103,9 @@ def read_header(folder: Path) -> dict[str, Any]:
     if not path.exists():
         raise SessionError(folder, "holds no session.toml", "a session folder", "make one with `smartnav import`")
     raw = read_toml(path, SessionError, "a session.toml")
-    known = {"schema", "device", "clock", "origin", "gravity_m_s2", "sensors", "calibration", "repair"}
-    unknown = sorted(set(raw) - known)
+    unknown = sorted(set(raw) - set(HEADER_KEYS))
     if unknown:
-        raise SessionError(path, f"unknown key {', '.join(unknown)}", f"some of {', '.join(sorted(known))}")
+        raise SessionError(path, f"unknown key {', '.join(unknown)}", f"some of {', '.join(sorted(HEADER_KEYS))}")
     if raw.get("schema", SCHEMA) != SCHEMA:
         raise SessionError(path, f"schema = {raw['schema']}", f"{SCHEMA}", "import the log again with this version")
     gravity = raw.get("gravity_m_s2")
