@@ -69,6 +69,8 @@ def fix_table(fixes: LoggedFixes, *, may_repeat: bool = False) -> tuple[Table, d
     """
     n = len(fixes.t_ns)
     height = np.full(n, np.nan) if fixes.height is None else np.where(fixes.height > -9000.0, fixes.height, np.nan)
+    if not np.nan_to_num(height).any():  # nothing but zeros: of fixes without a height
+        height = np.full(n, np.nan)
     columns: Table = {"t_ns": fixes.t_ns, "lat_deg": fixes.lat, "lon_deg": fixes.lon, "height_m": height}
     columns |= _sigmas(fixes) | _velocities(fixes)
     if fixes.fix_type is not None:
@@ -119,7 +121,7 @@ def _velocities(fixes: LoggedFixes) -> Table:
         sigma = np.broadcast_to(unmarked(fixes.velocity_sigma, n).reshape(n, -1), (n, 3))
     elif fixes.speed is not None and fixes.course is not None:
         speed, course = unmarked(fixes.speed, n), np.radians(unmarked(fixes.course, n))
-        course = np.where((speed == 0.0) & np.isnan(course), 0.0, course)
+        speed = np.where(speed == 0.0, np.nan, speed)  # of Android: no speed, as well as none known
         rows = np.stack([speed * np.sin(course), speed * np.cos(course), np.full(n, np.nan)], axis=-1)
         along = unmarked(fixes.speed_sigma, n)
         across = np.fmax(along, speed * np.radians(unmarked(fixes.course_sigma, n)))

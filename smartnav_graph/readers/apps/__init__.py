@@ -1,0 +1,1 @@
+"""Exports of logger apps and small recorders, one module a format."""

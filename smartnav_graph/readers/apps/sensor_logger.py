@@ -1,0 +1,239 @@
+"""Sensor Logger (Kelvin Choi; Android and iOS): folder or archive of CSV files, one a sensor, or one JSON file.
+
+Units and signs as its page UNITS.md and CROSSPLATFORM.md say: m/s^2, rad/s, uT, mbar; Unix nanoseconds. Android writes
+the acceleration with gravity to TotalAcceleration, without it to Accelerometer; iOS writes only the latter, and both
+it and Gravity with the opposite sign, AccelerometerUncalibrated in g, unless the units were standardised.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro
+from smartnav_graph.readers.fixes import LoggedFixes
+from smartnav_graph.readers.log_session import LogParts, log_session
+from smartnav_graph.readers.samples import Samples, in_time_order, summed
+from smartnav_graph.readers.source import Reader
+from smartnav_graph.readers.text import TextTable, read_bytes, read_text
+from smartnav_graph.readers.text_lines import head_of, heading_of
+from smartnav_graph.session.session import Session
+
+_log = logging.getLogger(__name__)
+_SENSORS = (
+    *("Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope"),
+    *("GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Barometer"),
+    *("Location", "LocationGps", "LocationNetwork"),
+)
+_METADATA = "Metadata"
+
+
+def _csv_files(folder: Path) -> dict[str, Path]:
+    """Files of known sensors in a folder, by name, with the heading of the app."""
+    if not folder.is_dir():
+        return {}
+    found = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.suffix.lower() == ".csv"}
+    return {name: file for name in (*_SENSORS, _METADATA) if (file := found.get(name.lower())) is not None}
+
+
+def _is_ours(file: Path) -> bool:
+    return {"time", "seconds_elapsed"} <= {name.lower() for name in heading_of(file)}
+
+
+def _is_json(path: Path) -> bool:
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    head = head_of(path).lower().replace(" ", "")
+    records = '"seconds_elapsed"' in head or '"values"' in head
+    return records and any(f'{key}:"{name.lower()}"' in head for key in ('"sensor"', '"name"') for name in _SENSORS)
+
+
+def _matches(source: str) -> bool:
+    try:
+        path = Path(source)
+        return _is_json(path) or any(_is_ours(file) for name, file in _csv_files(path).items() if name != _METADATA)
+    except (OSError, ValueError):  # ValueError: a zero byte in the name
+        return False
+
+
+def _read(source: str, repairs: tuple[str, ...]) -> Session:
+    path = Path(source)
+    if path.is_file():
+        tables, about = _of_json(path)
+    else:
+        tables = {}
+        for name, file in _csv_files(path).items():
+            if name != _METADATA and file.stat().st_size > 0 and _has_rows(file):
+                tables[name] = _small_letters(read_text(file, whole=True))
+        about = _metadata(path)
+    parts = LogParts()
+    samples = {name: _vector(table, repairs) for name, table in tables.items() if {"x", "y", "z"} <= set(table.cells)}
+    _add_imu(path, parts, samples, about)
+    if "Magnetometer" in samples:
+        parts.add_magnetometer(samples["Magnetometer"])
+    elif "MagnetometerUncalibrated" in samples:
+        parts.count("magnetometer", {"uncalibrated left out": len(samples["MagnetometerUncalibrated"])})
+    if "Barometer" in tables and "pressure" in tables["Barometer"].cells:
+        table = tables["Barometer"]
+        parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
+    location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
+    if location is not None:
+        parts.add_fixes(location.path, _fixes(location))
+    device = about.get("device name") or about.get("devicename") or about.get("platform") or "Sensor Logger"
+    return log_session(parts, repairs, name=device, epoch="unix")
+
+
+def _has_rows(file: Path) -> bool:
+    return len(head_of(file).strip().splitlines()) > 1
+
+
+def _small_letters(table: TextTable) -> TextTable:
+    names = [name.lower() for name in table.cells]
+    if len(set(names)) < len(names):
+        return table
+    return TextTable(table.path, dict(zip(names, table.cells.values(), strict=True)), table.skipped)
+
+
+def _metadata(folder: Path) -> dict[str, str]:
+    """The only row of Metadata.csv by column, in small letters; empty without the file."""
+    file = _csv_files(folder).get(_METADATA)
+    rows = [] if file is None else list(csv.reader(head_of(file).splitlines()))
+    return _about(dict(zip(rows[0], rows[1], strict=False))) if len(rows) > 1 else {}
+
+
+def _about(values: Mapping[str, object]) -> dict[str, str]:
+    return {name.strip().lower(): "" if value is None else str(value).strip() for name, value in values.items()}
+
+
+def _of_json(path: Path) -> tuple[dict[str, TextTable], dict[str, str]]:
+    """Tables by sensor, and the metadata, of a list of records ``{sensor, time, x, y, z}``, ``{sensor, time, values}``,
+    or of the messages that the app pushes."""
+    try:
+        found = json.loads(read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise SessionError(path, f"is no JSON ({error})", "a whole JSON file", "export the recording again") from error
+    rows: dict[str, list[dict[str, str]]] = {}
+    about: dict[str, str] = {}
+    known = {name.lower(): name for name in (*_SENSORS, _METADATA)}
+    for record in _records(found):
+        values = record.get("values")
+        flat = _about({**record, **(values if isinstance(values, dict) else {})})
+        name = known.get(str(record.get("sensor") or record.get("name") or "").lower())
+        if name == _METADATA:
+            about = flat
+        elif name is not None:
+            rows.setdefault(name, []).append(flat)
+    if not rows:
+        raise SessionError(path, "holds no record of a known sensor", "a list of {sensor, time, ...}", "export as JSON")
+    tables = {}
+    for name, of_sensor in rows.items():
+        columns = [column for column in of_sensor[0] if column not in ("sensor", "name", "values")]
+        tables[name] = TextTable.of(path, {column: [row.get(column, "") for row in of_sensor] for column in columns})
+    return tables, about
+
+
+def _records(found: object) -> Iterator[dict[str, object]]:
+    """The records of a file, those inside messages too."""
+    if isinstance(found, list):
+        for record in found:
+            yield from _records(record)
+    elif isinstance(found, dict):
+        if isinstance(found.get("payload"), list):
+            yield from _records(found["payload"])
+        else:
+            yield found
+
+
+def _vector(table: TextTable, repairs: tuple[str, ...]) -> Samples:
+    return _samples(table, ("x", "y", "z"), repairs)
+
+
+def _samples(table: TextTable, names: tuple[str, ...], repairs: tuple[str, ...]) -> Samples:
+    table.require(["time", *names])
+    stamped = table.known("time")
+    rows = table if stamped.all() else table.rows(stamped)
+    found = in_time_order(table.path, rows.times("time", 1), rows.floats(*names), repairs)
+    counts = {**table.skipped, **({"without a stamp left out": int((~stamped).sum())} if not stamped.all() else {})}
+    return Samples(found.file, found.t_ns, found.values, {**counts, **found.counts})
+
+
+def _add_imu(path: Path, parts: LogParts, samples: Mapping[str, Samples], about: Mapping[str, str]) -> None:
+    gyro = samples.get("Gyroscope") or samples.get("GyroscopeUncalibrated")
+    accel = _specific_force(path, samples, about)
+    if accel is not None and gyro is not None:
+        parts.add_imu(gyro, accel)
+    elif accel is not None or ("Accelerometer" in samples and gyro is None):
+        raise no_gyro(path, samples)
+    elif gyro is not None:
+        raise no_accelerometer(path, samples)
+
+
+def _specific_force(path: Path, samples: Mapping[str, Samples], about: Mapping[str, str]) -> Samples | None:
+    """Specific force m/s^2: with gravity where the app has it, else the sum, else the uncalibrated one."""
+    ios = about.get("platform", "").lower() in ("ios", "ipados", "iphone")
+    standard = about.get("standardisation", about.get("standardization", "")).lower() in ("true", "1", "yes", "on")
+    sign, unit = (1.0 if standard or not ios else -1.0), (1.0 if standard or not ios else STANDARD_GRAVITY)
+    if "TotalAcceleration" in samples:
+        found = samples["TotalAcceleration"]
+    elif "Accelerometer" in samples and "Gravity" in samples:
+        found = summed(samples["Accelerometer"], samples["Gravity"])
+    elif "AccelerometerUncalibrated" in samples:
+        found = samples["AccelerometerUncalibrated"]
+        if not about:  # units of iOS show the system
+            unit = STANDARD_GRAVITY if np.median(np.linalg.norm(found.values, axis=1)) < 3.0 else 1.0
+            sign = -1.0 if unit != 1.0 else 1.0
+            return Samples(found.file, found.t_ns, found.values * sign * unit, found.counts)
+        sign *= unit
+    else:
+        return None
+    if not about and "TotalAcceleration" not in samples:
+        sign = _likely_sign(path, found)
+    return Samples(found.file, found.t_ns, found.values * sign, found.counts)
+
+
+def _likely_sign(path: Path, force: Samples) -> float:
+    """Sign of iOS or Android where the log does not say which: a phone lies on its back, or its top is up."""
+    middle = np.median(force.values, axis=0)
+    axis = int(np.argmax(np.abs(middle)))
+    sign = -1.0 if middle[axis] < 0 else 1.0
+    system = "iOS (opposite sign)" if sign < 0 else "Android"
+    _log.warning("%s: no Metadata: taken as of %s, by the axis that points up", path, system)
+    return sign
+
+
+def _fixes(table: TextTable) -> LoggedFixes:
+    table.require(["time", "latitude", "longitude"])
+    table = table.rows(table.known("time"))
+
+    def column(name: str) -> Floats | None:
+        return table.floats(name) if name in table.cells else None
+
+    return LoggedFixes(
+        table.times("time", 1),
+        table.floats("latitude"),
+        table.floats("longitude"),
+        column("altitude"),
+        column("horizontalaccuracy"),
+        column("verticalaccuracy"),
+        column("speed"),
+        column("bearing"),
+        column("speedaccuracy"),
+        column("bearingaccuracy"),
+    )
+
+
+READER = Reader(
+    name="sensor-logger",
+    summary="Sensor Logger app (Android, iOS): CSV folder, zip or JSON",
+    recognised_by="CSV files such as Gyroscope.csv with columns time and seconds_elapsed, or its JSON",
+    matches=_matches,
+    read_source=_read,
+)
