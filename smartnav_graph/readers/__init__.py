@@ -22,6 +22,7 @@ from smartnav_graph.readers import (
     pyshoe,
     tyrex,
 )
+from smartnav_graph.readers.apps import APP_READERS
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
 from smartnav_graph.readers.robotics import ros
@@ -43,6 +44,7 @@ READERS: dict[str, Reader] = {
         indoor_waypoints.READER,
         kitti_odometry.READER,
         colmap.READER,
+        *APP_READERS,
         csv_folder.READER,
         nmea.READER,
         gpx.READER,

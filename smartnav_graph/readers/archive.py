@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.readers.apps.excel import is_excel
 
 
 def is_archive(path: Path) -> bool:
-    """Whether `path` is a zip or tar file, by content."""
+    """Whether `path` is a zip or tar file, by content; an Excel file, a zip file inside, is none."""
     try:
-        return path.is_file() and (zipfile.is_zipfile(path) or tarfile.is_tarfile(path))
+        return path.is_file() and (zipfile.is_zipfile(path) or tarfile.is_tarfile(path)) and not is_excel(path)
     except OSError:
         return False
 

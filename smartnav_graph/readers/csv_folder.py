@@ -15,6 +15,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Reader, build_session
 from smartnav_graph.readers.stamps import is_date
 from smartnav_graph.readers.text import TextTable, read_text
+from smartnav_graph.readers.text_lines import heading_of
 from smartnav_graph.session import repair
 from smartnav_graph.session.folder import read_header
 from smartnav_graph.session.session import Session
@@ -27,6 +28,15 @@ _STAMPS = {"t_s": NS, "t_ms": NS // 10**3, "t_us": NS // 10**6}  # columns that 
 
 def _files(folder: Path) -> dict[str, Path]:
     return {name: folder / f"{name}.csv" for name in STREAMS if (folder / f"{name}.csv").is_file()}
+
+
+def _matches(source: str) -> bool:
+    """Whether a file of a stream's name has a column of that stream: apps use such names too."""
+    for name, file in _files(Path(source)).items():
+        columns = {column for spec in STREAMS[name].specs() for column in spec.metadata["columns"]}
+        if {column.lower() for column in heading_of(file)} & {*columns, *_STAMPS}:
+            return True
+    return False
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
@@ -112,6 +122,6 @@ READER = Reader(
     name="csv",
     summary="folder of CSV files with the session's own columns",
     recognised_by="a folder with imu.csv, gnss.csv or another stream's name, and optionally session.toml",
-    matches=lambda source: bool(_files(Path(source))),
+    matches=_matches,
     read_source=_read,
 )
