@@ -199,10 +199,13 @@ def fixes_of(channels: Channels, t_ns: Times, rows: Mask | None = None) -> Logge
         t_ns[keep],
         lat[keep],
         lon[keep],
-        **{
-            role: kept(role)
-            for role in ("height", "horizontal", "vertical", "speed", "course", "speed_sigma", "course_sigma")
-        },
+        height=kept("height"),
+        horizontal=kept("horizontal"),
+        vertical=kept("vertical"),
+        speed=kept("speed"),
+        course=kept("course"),
+        speed_sigma=kept("speed_sigma"),
+        course_sigma=kept("course_sigma"),
     )
 
 

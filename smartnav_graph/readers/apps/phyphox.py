@@ -183,11 +183,11 @@ def _fixes(table: TextTable, t_ns: Times) -> LoggedFixes:
         t_ns,
         table.floats(degrees[0]),
         table.floats(degrees[1]),
-        height,
-        column("horizontalaccuracy", "accuracy", "horizontale"),
-        column("verticalaccuracy", "vertikale"),
-        table.floats(speeds[0]) if speeds else None,
-        table.floats(degrees[2]) if len(degrees) > 2 else None,
+        height=height,
+        horizontal=column("horizontalaccuracy", "accuracy", "horizontale"),
+        vertical=column("verticalaccuracy", "vertikale"),
+        speed=table.floats(speeds[0]) if speeds else None,
+        course=table.floats(degrees[2]) if len(degrees) > 2 else None,
     )
 
 

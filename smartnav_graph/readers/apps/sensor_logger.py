@@ -220,13 +220,13 @@ def _fixes(table: TextTable) -> LoggedFixes:
         table.times("time", 1),
         table.floats("latitude"),
         table.floats("longitude"),
-        column("altitude"),
-        column("horizontalaccuracy"),
-        column("verticalaccuracy"),
-        column("speed"),
-        column("bearing"),
-        column("speedaccuracy"),
-        column("bearingaccuracy"),
+        height=column("altitude"),
+        horizontal=column("horizontalaccuracy"),
+        vertical=column("verticalaccuracy"),
+        speed=column("speed"),
+        course=column("bearing"),
+        speed_sigma=column("speedaccuracy"),
+        course_sigma=column("bearingaccuracy"),
     )
 
 
