@@ -121,7 +121,8 @@ def _velocities(fixes: LoggedFixes) -> Table:
         sigma = np.broadcast_to(unmarked(fixes.velocity_sigma, n).reshape(n, -1), (n, 3))
     elif fixes.speed is not None and fixes.course is not None:
         speed, course = unmarked(fixes.speed, n), np.radians(unmarked(fixes.course, n))
-        speed = np.where(speed == 0.0, np.nan, speed)  # of Android: no speed, as well as none known
+        speed = np.where((speed == 0.0) & (course == 0.0), np.nan, speed)  # of Android: no speed, or none known
+        course = np.where((speed == 0.0) & np.isnan(course), 0.0, course)
         rows = np.stack([speed * np.sin(course), speed * np.cos(course), np.full(n, np.nan)], axis=-1)
         along = unmarked(fixes.speed_sigma, n)
         across = np.fmax(along, speed * np.radians(unmarked(fixes.course_sigma, n)))

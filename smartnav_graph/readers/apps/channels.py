@@ -132,7 +132,7 @@ def _vector_role(quantity: str, patterns: Mapping[str, str]) -> tuple[str, str]:
     return "", ""
 
 
-def specific_force(channels: Channels, sign: float = 1.0) -> Floats | None:
+def force_of(channels: Channels, sign: float = 1.0) -> Floats | None:
     """Specific force (n, 3) m/s^2 of the columns that have gravity in them; None where there is no accelerometer.
 
     sign : -1 for logs of iOS, which give it with the opposite sign

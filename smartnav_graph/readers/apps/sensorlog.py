@@ -20,10 +20,10 @@ from smartnav_graph.readers.apps.channels import (
     Channels,
     channels_of,
     fixes_of,
+    force_of,
     no_accelerometer,
     no_gyro,
     read_vector,
-    specific_force,
 )
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples, clock_offset
@@ -149,7 +149,7 @@ def _force(channels: Channels, clock: _Clock, repairs: tuple[str, ...]) -> Sampl
     else:
         return None
     found = channels_of(rows)
-    values = specific_force(found, sign=-1.0)
+    values = force_of(found, sign=-1.0)
     return None if values is None else read_vector(rows, t_ns, values, repairs)
 
 

@@ -20,10 +20,10 @@ from smartnav_graph.readers.apps.channels import (
     Channels,
     channels_of,
     fixes_of,
+    force_of,
     no_accelerometer,
     no_gyro,
     read_vector,
-    specific_force,
 )
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.source import Reader
@@ -186,7 +186,7 @@ def _read(app: WideApp, source: str, repairs: tuple[str, ...]) -> Session:
     for channels, t_ns, _ in logs:
         seen += [*channels.vectors, *channels.scalars]
         if force is None and any(channels.has(role) for role in ("accel", "gforce", "linear")):
-            values = specific_force(channels)
+            values = force_of(channels)
             force = None if values is None else read_vector(channels.table, t_ns, values, repairs)
         if channels.has("field"):
             parts.add_magnetometer(read_vector(channels.table, t_ns, channels.vector("field"), repairs))
