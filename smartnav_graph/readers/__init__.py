@@ -25,7 +25,7 @@ from smartnav_graph.readers import (
 from smartnav_graph.readers.apps import APP_READERS
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
-from smartnav_graph.readers.robotics import ros
+from smartnav_graph.readers.robotics import ros, ulog
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.unknown import describe_unknown
 from smartnav_graph.session import folder as session_folder
@@ -52,6 +52,7 @@ READERS: dict[str, Reader] = {
         listed.FIXES,
         listed.CONTROL,
         ros.READER,
+        ulog.READER,
     )
 }
 
