@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from smartnav_graph.cli.options import Command, Repairs, SourceName, Switch, Text, Writing, repairs
+from smartnav_graph.cli.options import Command, Repairs, Reporting, SourceName, Switch, Text, Writing, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
 from smartnav_graph.core.errors import ConfigError
@@ -83,8 +83,8 @@ class Import(Writing):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Info(Command):
-    """Check a session: streams, rates, data gaps, clock, gravity, missing streams, possible faults.
+class Info(Reporting):
+    """Check a session: when and where, streams, rates, data gaps, clock, gravity, what is missing, possible faults.
 
     Example: smartnav info kitti
     """
@@ -94,14 +94,34 @@ class Info(Command):
     repair: Repairs = None
     """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
 
-    def run(self) -> None:
+    def run(self) -> int | None:
         from smartnav_graph import readers
+        from smartnav_graph.output.session_info import SessionInfo
         from smartnav_graph.session import health
 
+        if readers.is_unknown(self.session):
+            return self._describe()
         with progress(self.quiet) as show:
             show(f"reading {self.session}", 0, 0)
             session = readers.load(self.session, repairs=repairs(self.repair))
-        print_findings(session_text(session) + "\n" + health.inspect(session).to_text())
+        found = SessionInfo(session, health.inspect(session))
+        if self.json:
+            self.report(found.to_dict(), "")
+        else:
+            print_findings(found.to_text())
+        return None
+
+    def _describe(self) -> int:
+        """What a file of no known format looks like; exit code 1."""
+        from smartnav_graph.readers.unknown import describe_unknown
+
+        seen = describe_unknown(self.session)
+        lines = [f"{self.session}: is of no known format", *(f"  {line}" for line in seen.seen)]
+        if seen.columns:
+            lines.append(f'import it with: smartnav import {self.session} --out S --columns "{seen.columns}"')
+        lines.append("or write CSV with the columns of `smartnav formats --columns`")
+        self.report({"format": None, "seen": seen.seen, "columns": seen.columns or None}, "\n".join(lines))
+        return 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,7 +56,7 @@ READERS: dict[str, Reader] = {
     )
 }
 
-__all__ = ["READERS", "Reader", "find", "load", "read"]
+__all__ = ["READERS", "Reader", "find", "is_unknown", "load", "read"]
 
 
 def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
@@ -75,6 +75,14 @@ def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
     folder = Path(source)
     ours = (folder / "session.toml").is_file() and not any(folder.glob("*.csv"))
     return session_folder.load(folder, repairs=repairs) if ours else read(source, repairs=repairs)
+
+
+def is_unknown(source: str | Path) -> bool:
+    """Whether a file or folder is there, but neither a session nor an archive nor of a known format."""
+    path = Path(source)
+    if not path.exists() or (path / "session.toml").is_file() or is_archive(path):
+        return False
+    return not any(reader.matches(str(source)) for reader in READERS.values())
 
 
 def find(source: str | Path, name: str | None = None) -> Reader:

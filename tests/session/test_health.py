@@ -16,7 +16,16 @@ from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.session.health import Health, inspect, tilt_errors
 from smartnav_graph.session.session import Device, Mount, Session
-from smartnav_graph.session.streams import Barometer, ControlPoint, GnssFix, Imu, Magnetometer, StaticPeriod
+from smartnav_graph.session.streams import (
+    Barometer,
+    ControlPoint,
+    GnssFix,
+    Images,
+    Imu,
+    Magnetometer,
+    StaticPeriod,
+    Tracks,
+)
 from smartnav_graph.simulation.scenarios import simulate
 
 T0 = 1_748_772_000 * NS
@@ -326,19 +335,22 @@ def test_sigmas_heights_and_repairs_are_reported():
     assert "1 of 29 rows have no sigma" in only(partly, "info")
 
 
-def test_text_names_everything():
-    text = inspect(make_session(gnss=make_fixes(-3.0, 32.0))).to_text()
-    for part in (
-        "imu",
-        "3000",
-        "100.00",
-        "gravity: 9.81000",
-        "clock: unix",
-        "gaps: 0",
-        "missing: calibration",
-        "warning: gnss: 5",
-    ):
-        assert part in text
+def test_pictures_that_are_missing(tmp_path):
+    """A warning before matching, an information after it, nothing where all are there or none is named."""
+    (tmp_path / "a.png").touch()
+    t_ns = make_imu().t_ns[:2]
+    images = Images(t_ns=t_ns, image_id=[0, 1], file=["a.png", "b.png"], camera=["cam", "cam"])
+    session = make_session(images=images, pictures=tmp_path)
+    assert only(inspect(session), "warning") == (
+        "images: 1 of 2 pictures are missing, the first is b.png; copy them, or import the whole folder"
+    )
+    tracks = Tracks(t_ns=t_ns[:1], image_id=[0], track_id=[0], xy_n=np.zeros((1, 2)))
+    done = [str(finding) for finding in inspect(session.replace(tracks=tracks)).findings]
+    assert any("1 of 2 pictures are missing" in finding and "not needed" in finding for finding in done)
+    (tmp_path / "b.png").touch()
+    assert not any("pictures" in str(finding) for finding in inspect(session).findings)
+    unnamed = replace(images, file=np.array(["", ""], dtype=object))
+    assert not any("pictures" in str(finding) for finding in inspect(session.replace(images=unnamed)).findings)
 
 
 DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).parents[3] / "shared" / "datasets"))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.timebase import Gap, find_gaps, seconds_since
+from smartnav_graph.core.timebase import Gap, find_gaps
 from smartnav_graph.session.health import axes, inertial, positions, sensors
 from smartnav_graph.session.health import streams as all_streams
 from smartnav_graph.session.health.clocks import ClockReport, compare_clocks
@@ -64,22 +64,6 @@ class Health:
         for finding in self.findings:
             if finding.level == "error":
                 raise SessionError(finding.where, finding.text, remedy=finding.remedy)
-
-    def to_text(self) -> str:
-        """Plain lines for a terminal."""
-        lines = [f"{'stream':<14}{'rows':>9}{'start s':>12}{'length s':>12}{'rate Hz':>10}"]
-        lines += [
-            f"{s.name:<14}{s.rows:>9}{s.start_s:>12.3f}{s.length_s:>12.3f}{s.rate_hz:>10.2f}" for s in self.streams
-        ]
-        quiet = "no quiet stretch" if self.quiet_accel_m_s2 is None else f"{self.quiet_accel_m_s2:.4f} m/s^2 at rest"
-        lines += [
-            f"clock: {self.clock_epoch}, time zero {self.t0_ns} ns",
-            f"gravity: {self.gravity_m_s2:.5f} m/s^2 expected, accelerometer {quiet}",
-            f"gaps: {len(self.gaps)}",
-        ]
-        lines += [f"  {g.kind} {g.length_s:.3f} s at {seconds_since(g.start_ns, self.t0_ns):.3f} s" for g in self.gaps]
-        lines.append(f"missing: {', '.join(self.missing) or 'nothing'}")
-        return "\n".join(lines + [f"{finding.level}: {finding}" for finding in self.findings])
 
 
 def inspect(session: Session, gaps: Sequence[Gap] | None = None, clocks: ClockReport | None = None) -> Health:

@@ -222,4 +222,18 @@ def _standstills(facts: Facts) -> Iterator[Finding]:
         yield Finding("static", text, "check their stamps; a false standstill bends the trajectory")
 
 
-RULES = (_field, _pressure, _temperature, _speeds, _standstills)
+def _pictures(facts: Facts) -> Iterator[Finding]:
+    """Images without their picture; matches and tracks do not need it any more."""
+    images, folder = facts.session.images, facts.session.pictures
+    if images is None:
+        return
+    files = [file for file in map(str, images.file) if file]
+    lost = [file for file in files if folder is None or not (folder / file).is_file()]
+    if lost:
+        done = facts.session.matches is not None or facts.session.tracks is not None
+        text = f"{len(lost)} of {len(files)} pictures are missing, the first is {lost[0]}"
+        remedy = "not needed, as there are matches or tracks" if done else "copy them, or import the whole folder"
+        yield Finding("images", text, remedy, "info" if done else "warning", verdict="good")
+
+
+RULES = (_field, _pressure, _temperature, _speeds, _standstills, _pictures)
