@@ -18,11 +18,13 @@ from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
+from smartnav_graph.session.detect.out_of_reach import out_of_reach
 from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.detect.standstills import Standstills, find_standstills
 from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.health.inertial import spikes
+from smartnav_graph.session.health.positions import reach_finding
 from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
@@ -99,6 +101,24 @@ def find_imu_gaps(session: Session, notes: Notes) -> Session:
     return session
 
 
+def drop_out_of_reach(session: Session, notes: Notes) -> Session:
+    """Positions without those that the device cannot have visited beside the others; in a replay the set that counts is
+    found by what is known at first."""
+    changes: dict[str, Stream | None] = {}
+    for name, stream in session.positions().items():
+        known = None
+        if notes.causal and len(stream):
+            first = max(notes.span[0] + round(INITIALISATION_S * NS), int(stream.available_ns.min()))
+            known = stream.available_ns <= first
+        out = out_of_reach(stream, session.nav_position(stream), known)
+        if out.any():
+            changes[name] = stream.take(~out)
+            notes.drop("out of reach of the others", {name: int(out.sum())})
+            notes.findings = [*notes.findings, reach_finding(session, name, out)]
+            notes.warnings.append(str(notes.findings[-1]))
+    return session.replace(**changes) if changes else session
+
+
 def align_clocks(session: Session, notes: Notes) -> Session:
     """Fixes on the clock of the inertial data, where both show that they are not, by more than the state of a clock
     takes. By rows that are not withheld; in a replay by what is known when it begins, and what all rows show of an
@@ -126,7 +146,7 @@ def check_health(session: Session, notes: Notes) -> Session:
     checked = health.inspect(session, notes.gaps, notes.clocks)
     checked.raise_errors()
     notes.warnings += checked.warnings()
-    notes.findings = [finding for finding in checked.findings if finding.level == "warning"]
+    notes.findings = [*notes.findings, *(found for found in checked.findings if found.level == "warning")]
     session, wrong = without_wrong_units(session, checked.findings)
     notes.warnings += [f"{name}: not used, because it is in another unit" for name in wrong]
     return session
@@ -285,6 +305,7 @@ def refute_standstills(session: Session, notes: Notes) -> Session:
 PREPARE: Mapping[str, PreparationStep] = {
     "span": choose_span,
     "gaps": find_imu_gaps,
+    "reach": drop_out_of_reach,
     "clocks": align_clocks,
     "health": check_health,
     "spikes": drop_spikes,

@@ -234,8 +234,17 @@ def test_standstills_count_by_their_span():
 def test_jumping_fixes():
     fixes = make_fixes()
     enu = np.array(fixes.enu)
-    enu[12] += [0.0, 400.0, 0.0]
+    enu[12] += [0.0, 150.0, 0.0]
     assert "2 jumps faster than 100 m/s, the first at 12.000 s" in only(
+        inspect(make_session(gnss=replace(fixes, enu=enu))), "warning"
+    )
+
+
+def test_a_fix_out_of_reach_of_the_others():
+    fixes = make_fixes()
+    enu = np.array(fixes.enu)
+    enu[12] += [0.0, 4e5, 0.0]
+    assert "1 of 29 positions lie up to 400 km from the others" in only(
         inspect(make_session(gnss=replace(fixes, enu=enu))), "warning"
     )
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.detect.out_of_reach import out_of_reach
 from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.health.facts import (
     LEAST_ROWS,
@@ -20,16 +21,31 @@ from smartnav_graph.session.health.facts import (
     over_chords,
     repeats,
 )
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 
 _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
 _FAR_M = 50_000.0  # two sensors of one session
 _FROZEN_FIXES_S = 10.0
+_MANY_OUT, _MOST_OUT = 0.1, 0.3  # share of positions out of reach: suspect, and two places at once
 _LARGE_SCATTER = 4.0  # times the stated sigma
 _STALE_SPEED, _STALE_SHARE = 1.0, 0.2  # m/s between fixes, share of rows
 _HEIGHTS_M = (-500.0, 9000.0)  # of the Earth's land
 _GEOID_M = (8.0, 110.0)  # offsets of two heights that look like the geoid
 _ATTITUDE_PAIRS, _LEAST_PAIRS, _ATTITUDE_PAIR_S = 100, 5, 15.0
+
+
+def reach_finding(session: Session, name: str, out: Mask) -> Finding:
+    """The finding of positions of one stream, some of which are `out` (n,) of reach of the others."""
+    stream, rows = session.positions()[name], np.flatnonzero(out)
+    position, kept = session.nav_position(stream), np.flatnonzero(~out)
+    others = kept[np.clip(np.searchsorted(kept, rows), 0, len(kept) - 1)]
+    size, share = float(np.linalg.norm(position[rows] - position[others], axis=1).max()), float(out.mean())
+    level = "contradictory" if share > _MOST_OUT else "doubtful" if share > _MANY_OUT else "good"
+    text = f"{len(rows)} of {len(out)} positions lie up to {size / 1e3:.4g} km from the others, more than any motion"
+    remedy = "remove what is wrong: one device was not in both places"
+    start_ns, end_ns = int(stream.t_ns[rows[0]]), int(stream.t_ns[rows[-1]])
+    return Finding(name, text, remedy, verdict=level, size=size, start_ns=start_ns, end_ns=end_ns)
 
 
 def _jumps(facts: Facts) -> Iterator[Finding]:
@@ -38,6 +54,10 @@ def _jumps(facts: Facts) -> Iterator[Finding]:
         if stream is None or len(stream) < 2:
             continue
         position = facts.session.nav_position(stream)
+        out = out_of_reach(stream, position)
+        if out.any():
+            yield reach_finding(facts.session, name, out)
+            continue
         # a jump must exceed the noise of both fixes, or 10 Hz fixes would always jump
         sigma = np.linalg.norm(np.nan_to_num(stream.sigma, nan=5.0), axis=1) if stream.sigma is not None else 5.0
         noise = 4.0 * np.broadcast_to(sigma, len(position))
