@@ -13,7 +13,7 @@ Source: ICAO Doc 7488 (1993), Manual of the ICAO standard atmosphere; below 11 k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -28,7 +28,7 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import BarometerNoise
 from smartnav_graph.session.streams import Barometer
 
@@ -103,6 +103,7 @@ class BarometerBuilder(Builder):
     stage: int = 0
     lookahead_s: float = HALF_S
     _start: float = 0.0
+    _means: PerWindow[tuple[float, float, float] | None] = field(default_factory=PerWindow)
 
     def begin(self) -> BarometerBuilder:
         return replace(self, _start=0.0)
@@ -110,7 +111,7 @@ class BarometerBuilder(Builder):
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """The bias at the keyframe, tied to the one before, and the mean height around the keyframe."""
         bias = key("D", window.index)
-        measured = self._around(window)
+        measured = self._means.of(window, self._around)
         if previous is None and measured is not None and update.predicted is not None:
             self._start = measured[0] - float(update.predicted.position()[2])
         update.chain[bias] = np.array([self._start])

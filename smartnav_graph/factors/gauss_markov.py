@@ -16,8 +16,10 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import FactorId, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import GnssNoise
+
+Ties = PerWindow[gtsam.NonlinearFactor]
 
 
 def correlated_sigma(noise: GnssNoise) -> Floats:
@@ -26,17 +28,23 @@ def correlated_sigma(noise: GnssNoise) -> Floats:
     return np.array([h, h, v])
 
 
-def add_correlated_error(update: GraphUpdate, window: Window, previous: State | None, noise: GnssNoise) -> None:
-    """The Gauss-Markov state of one keyframe and its tie to the one before."""
+def add_correlated_error(
+    update: GraphUpdate, window: Window, previous: State | None, noise: GnssNoise, ties: Ties
+) -> None:
+    """The Gauss-Markov state of one keyframe and its tie to the one before; ties : of earlier passes."""
     name = key("C", window.index)
     update.chain[name] = np.zeros(3)
     sigma, tag = correlated_sigma(noise), FactorId("gnss_correlated_error", window.t1_ns)
     if previous is None:
         update.add(tag, gtsam.PriorFactorVector(name, np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
         return
-    phi = float(np.exp(-window.length_s / noise.correlated_time))
-    root = np.diag(1.0 / (sigma * np.sqrt(1.0 - phi**2)))
-    update.add(tag, decay(key("C", window.index - 1), name, phi, root))
+
+    def tie(window: Window) -> gtsam.NonlinearFactor:
+        phi = float(np.exp(-window.length_s / noise.correlated_time))
+        root = np.diag(1.0 / (sigma * np.sqrt(1.0 - phi**2)))
+        return decay(key("C", window.index - 1), name, phi, root)
+
+    update.add(tag, ties.of(window, tie))
 
 
 def decay(before: int, after: int, phi: float, root: Floats) -> gtsam.NonlinearFactor:

@@ -20,13 +20,13 @@ from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.gauss_markov import add_correlated_error, correlated_sigma
+from smartnav_graph.factors.gauss_markov import Ties, add_correlated_error, correlated_sigma
 from smartnav_graph.factors.observation import Observed, PartialPreintegration, at_keyframe, preintegrated, row_model
 from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
 from smartnav_graph.session.detect.scatter import Scatter, agrees_with_neighbours, scatter
 from smartnav_graph.session.stream import Positioned
@@ -128,6 +128,7 @@ class PositionBuilder(Builder):
     scatter: tuple[Scatter | None, Scatter | None] = (None, None)
     agrees: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
     stage: int = 0
+    _ties: Ties = field(default_factory=PerWindow)
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
     def __post_init__(self) -> None:
@@ -187,9 +188,11 @@ class PositionBuilder(Builder):
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scales of this sensor."""
+        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * self._scale(pass_state))
+
+    def _scale(self, pass_state: PassState) -> Floats:
         horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
-        scale = np.array([horizontal, horizontal, vertical])
-        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * scale)
+        return np.array([horizontal, horizontal, vertical])
 
     def gate(
         self, square: Floats, level: float, rows: NDArray[np.intp], probability: float | None = None
@@ -242,7 +245,7 @@ class PositionBuilder(Builder):
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A factor for every row of this stream that became known in the window."""
         if self.name in pass_state.correlated:
-            add_correlated_error(update, window, previous, self.noise)
+            add_correlated_error(update, window, previous, self.noise, self._ties)
         states = self._states(pass_state)
         for row in window.rows.get(self.name, ()):
             self._add_row(update, int(row), pass_state, states, self._at_keyframe(update, window, states))
@@ -276,7 +279,7 @@ class PositionBuilder(Builder):
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        sigma = self.scaled_sigma(pass_state)[row]
+        sigma = self.sigma[row] if self.own_sigma[row] else self.sigma[row] * self._scale(pass_state)
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:

@@ -28,7 +28,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.magnetometer import turned_mean
+from smartnav_graph.factors.magnetometer import TurnedSamples
 from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
@@ -94,8 +94,8 @@ class Stretch:
         starts = window.t0_ns + ns_from_seconds(np.concatenate([[0.0], np.cumsum(window.dt)[:-1]]))
         size = np.linalg.norm(window.accel, axis=1)
         weighted = window.accel * window.dt[:, None]
-        mean, _ = turned_mean(window, starts, weighted, gyro_bias)
-        _, whole = turned_mean(window, starts[:1], weighted[:1], gyro_bias)
+        mean, _ = TurnedSamples.of(window, starts, weighted).mean(gyro_bias)
+        _, whole = TurnedSamples.of(window, starts[:1], weighted[:1]).mean(gyro_bias)
         self.force = whole @ self.force + mean * len(starts)
         self.size += float(size @ window.dt)
         self.square += float(size**2 @ window.dt)

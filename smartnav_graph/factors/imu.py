@@ -100,11 +100,22 @@ class Kept(NamedTuple):
     pim: Pim
 
 
+class _Parts(NamedTuple):
+    """Parts (9, 9) of the covariance of `pim`: of accelerometer and gyroscope at scale one, and of the integration."""
+
+    pim: Pim
+    accel: Floats
+    gyro: Floats
+    integration: Floats
+
+
 @dataclass
 class Preintegrated:
-    """Windows preintegrated in earlier passes, by index, and the wall seconds that all of it took."""
+    """Windows preintegrated in earlier passes, by index, with the parts of their covariances; and the wall seconds that
+    all of it took."""
 
     windows: dict[int, Kept] = field(default_factory=dict)
+    parts: dict[int, _Parts] = field(default_factory=dict)
     seconds: float = 0.0
 
 
@@ -200,13 +211,15 @@ class ImuBuilder(Builder):
     def _covariance(self, window: Window, pim: Pim, pass_state: PassState) -> Floats:
         """Covariance (9, 9) of a window with the noise of `pass_state`, whatever noise it was preintegrated with."""
         scales, old = (pass_state.scale("accel"), pass_state.scale("gyro")), self.cache.windows[window.index].scales
-        covariance: Floats = pim.preintMeasCov()
         if scales == old:
-            return covariance
-        accel = accel_part([window], self.noise.accel_noise_density)[0]
-        integration = integration_part([window], self.config.integration_sigma)[0]
-        gyro = (covariance - old[0] ** 2 * accel - integration) / old[1] ** 2
-        return np.asarray(scales[0] ** 2 * accel + scales[1] ** 2 * gyro + integration)
+            return np.asarray(pim.preintMeasCov())
+        parts = self.cache.parts.get(window.index)
+        if parts is None or parts.pim is not pim:
+            accel = accel_part([window], self.noise.accel_noise_density)[0]
+            integration = integration_part([window], self.config.integration_sigma)[0]
+            gyro = (pim.preintMeasCov() - old[0] ** 2 * accel - integration) / old[1] ** 2
+            parts = self.cache.parts[window.index] = _Parts(pim, accel, gyro, integration)
+        return scales[0] ** 2 * parts.accel + scales[1] ** 2 * parts.gyro + parts.integration
 
     def _factor(self, window: Window, pim: Pim, pass_state: PassState) -> gtsam.NoiseModelFactor:
         i, j = window.index - 1, window.index

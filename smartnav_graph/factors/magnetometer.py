@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import MagnetometerNoise
 from smartnav_graph.session.streams import Magnetometer
 
@@ -93,21 +94,32 @@ class SeenField:
 MODEL = AtKeyframe(SeenField())
 
 
-def turned_mean(window: Window, t_ns: NDArray[np.int64], field_ut: Floats, gyro_bias: Floats) -> tuple[Floats, Floats]:
-    """Mean of samples seen from the window's end: reading (3,), and the mean turn (3, 3) from their axes to the end's.
+class TurnedSamples(NamedTuple):
+    """Samples (m, 3) of a window in body axes, to be seen from its end; step_s (m,) and angle (m, 3) rad, time to the next one, or the
+    window's end, and integral of the rate as read until then."""
 
-    t_ns (m,) in (t0, t1], field_ut (m, 3), gyro_bias (3,) rad/s. Between samples the turn is the integral of the rate.
-    """
-    border = np.concatenate([[0.0], np.cumsum(window.dt)])
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((window.gyro - gyro_bias) * window.dt[:, None], axis=0)])
-    at = np.append((t_ns - window.t0_ns) / NS, border[-1])
-    reached = np.stack([np.interp(at, border, column) for column in angle.T], axis=-1)
-    steps = exp(reached[1:] - reached[:-1])
-    turns, total = np.empty((len(t_ns), 3, 3)), np.eye(3)
-    for k in range(len(t_ns) - 1, -1, -1):
-        total = total @ steps[k].T
-        turns[k] = total
-    return np.asarray(rotate(turns, field_ut).mean(axis=0)), np.asarray(turns.mean(axis=0))
+    samples: Floats
+    step_s: Floats
+    angle: Floats
+
+    @classmethod
+    def of(cls, window: Window, t_ns: NDArray[np.int64], samples: Floats) -> TurnedSamples:
+        """t_ns (m,) in [t0, t1], samples (m, 3)."""
+        border = np.concatenate([[0.0], np.cumsum(window.dt)])
+        angle = np.concatenate([np.zeros((1, 3)), np.cumsum(window.gyro * window.dt[:, None], axis=0)])
+        at = np.minimum(np.append((t_ns - window.t0_ns) / NS, border[-1]), border[-1])
+        reached = np.stack([np.interp(at, border, column) for column in angle.T], axis=-1)
+        return cls(samples, np.diff(at), np.diff(reached, axis=0))
+
+    def mean(self, gyro_bias: Floats) -> tuple[Floats, Floats]:
+        """Mean (3,) of the samples in the axes of the window's end, and the mean turn (3, 3) from their axes to these;
+        gyro_bias (3,) rad/s."""
+        turns = exp(self.angle - self.step_s[:, None] * gyro_bias).transpose(0, 2, 1)
+        count, m = 1, len(turns)
+        while count < m:  # each holds the product of `count` steps
+            turns[: m - count] = turns[count:] @ turns[: m - count]
+            count *= 2
+        return rotate(turns, self.samples).sum(axis=0) / m, turns.sum(axis=0) / m
 
 
 @dataclass
@@ -129,6 +141,7 @@ class MagnetometerBuilder(Builder):
     name: str = "magnetometer"
     stage: int = LAST_STAGE
     held_in_replay: bool = False
+    _samples: PerWindow[tuple[int, TurnedSamples | None]] = field(default_factory=PerWindow)
 
     def __post_init__(self) -> None:
         self.soft_iron = np.reshape(self.noise.soft_iron, (3, 3))
@@ -146,15 +159,14 @@ class MagnetometerBuilder(Builder):
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """One row at the end of the window, where it has samples and the gyro their rotation."""
-        last = int(np.searchsorted(self.t_ns, window.t1_ns, side="right"))
-        first = int(np.searchsorted(self.t_ns, window.t0_ns, side="right"))
-        if last == first or window.kind in ("first", "gap") or previous is None:
+        if window.kind in ("first", "gap") or previous is None:
             return
-        rows = np.arange(first, last)[:: -(-(last - first) // MOST_SAMPLES)]
-        corrected = self.reading[rows] @ self.soft_iron.T
-        y, turn = turned_mean(window, self.t_ns[rows], corrected, previous.bias.gyroscope())
+        last, samples = self._samples.of(window, self._samples_of)
+        if samples is None:
+            return
+        y, turn = samples.mean(previous.bias.gyroscope())
         A = turn @ self.soft_iron
-        sigma, shared = self.sigma(window.length_s, len(rows)), self.shared(window.length_s)
+        sigma, shared = self.sigma(window.length_s, len(samples.step_s)), self.shared(window.length_s)
         iron, iron_sigma = self.iron_at_start(pass_state)
         known = sigma**2 + self.field_sigma**2 + iron_sigma**2
         level = update.predicted.attitude().matrix() @ (y - A @ iron.initial)
@@ -165,6 +177,15 @@ class MagnetometerBuilder(Builder):
         update.blocks.append(
             FactorBatch(self.name, MODEL, [keys], data[None], update.t_ns, (last - 1,), (used,), loss, loss_scale)
         )
+
+    def _samples_of(self, window: Window) -> tuple[int, TurnedSamples | None]:
+        """The samples of a window, some of them where they are many, and the row after the last."""
+        last = int(np.searchsorted(self.t_ns, window.t1_ns, side="right"))
+        first = int(np.searchsorted(self.t_ns, window.t0_ns, side="right"))
+        if last == first:
+            return last, None
+        rows = np.arange(first, last)[:: -(-(last - first) // MOST_SAMPLES)]
+        return last, TurnedSamples.of(window, self.t_ns[rows], self.reading[rows] @ self.soft_iron.T)
 
     def sigma(self, length_s: float, count: int) -> float:
         """Sigma (uT) of a row of `count` samples over `length_s` s.

@@ -28,7 +28,7 @@ from smartnav_graph.factors.observation import AtKeyframe, Observed
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, StandstillConfig, Standstills
 
 TAIL = 4.0
@@ -72,13 +72,14 @@ class StandstillBuilder(Builder):
     stage: int = 0
     lookahead_s: float = LOOKAHEAD_S
     _floor: SessionState | None = None
+    _sigmas: PerWindow[tuple[float, float]] = field(default_factory=PerWindow)
 
     def begin(self) -> StandstillBuilder:
         return replace(self, _floor=None)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors at the keyframe that ends `window`."""
-        speed = self.rests.speed_at(window.t1_ns)
+        speed, turn = self._sigmas.of(window, self._sigmas_of)
         if np.isfinite(speed) and pass_state.refuted and self.rests.start_of(window.t1_ns) in pass_state.refuted:
             return
         if np.isfinite(speed):
@@ -86,10 +87,13 @@ class StandstillBuilder(Builder):
                 self._add_speed(update, speed, _unknown(previous))
             if self.config.flat_floor and self.rests.on_foot:
                 self._add_level(update)
-        if self.config.zaru and previous is not None and window.kind != "gap":
-            turn = self.rests.over(self.rests.turn_sigma, window.t0_ns, window.t1_ns)
-            if np.isfinite(turn):
-                self._add_turn(update, turn)
+        if self.config.zaru and previous is not None and window.kind != "gap" and np.isfinite(turn):
+            self._add_turn(update, turn)
+
+    def _sigmas_of(self, window: Window) -> tuple[float, float]:
+        """Of the speed at a window's end, and of the turn in it; NaN in motion."""
+        turn = self.rests.over(self.rests.turn_sigma, window.t0_ns, window.t1_ns)
+        return self.rests.speed_at(window.t1_ns), turn
 
     def _add_speed(self, update: GraphUpdate, sigma: float, unknown: float) -> None:
         loss_scale = max(LOSS_SCALE_SPEED / sigma, INCONSISTENT * unknown / sigma, TAIL)

@@ -16,7 +16,7 @@ Dynamics, ch. 6, on cornering compliance.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import STATES, SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import VEHICLE_CLASSES, VehicleNoise
 from smartnav_graph.session.detect.standstills import LOOKAHEAD_S, Standstills
 
@@ -180,6 +180,11 @@ def latest(window: Window, values: Floats, seconds: float) -> Floats:
     return np.asarray(half + (half - whole))
 
 
+def _read_at_end(window: Window) -> tuple[Floats, Floats]:
+    """Rate (3,) and specific force (3,) as read at the window's end."""
+    return recent(window, window.gyro, RATE_S), latest(window, window.accel, FORCE_S)
+
+
 def due(window: Window, period_s: float) -> bool:
     """Whether a border of the clock's periods lies in the window: at most one row a period, the same in every pass."""
     period = round(period_s * NS)
@@ -202,6 +207,7 @@ class VehicleBuilder(Builder):
     name: str = "vehicle"
     stage: int = 1
     lookahead_s: float = LOOKAHEAD_S
+    _read: PerWindow[tuple[Floats, Floats]] = field(default_factory=PerWindow)
 
     def __post_init__(self) -> None:
         self.model = AtKeyframe(NonHolonomic(self.body_R_vehicle))
@@ -215,8 +221,8 @@ class VehicleBuilder(Builder):
         """One row at the end of the window, where one is due."""
         if not len(window.dt) or not due(window, self.config.period_s) or self._silent(update):
             return
-        rate = recent(window, window.gyro, RATE_S) - update.bias.gyroscope()
-        force = latest(window, window.accel, FORCE_S) - update.bias.accelerometer()
+        rate, force = self._read.of(window, _read_at_end)
+        rate, force = rate - update.bias.gyroscope(), force - update.bias.accelerometer()
         sigma = [known * pass_state.scale(group) for group, known in self.noise_groups.items()]
         data = np.concatenate([rate @ self.body_R_vehicle, force @ self.body_R_vehicle, sigma])
         keys = [key("X", update.index), key("V", update.index), update.use(mount_state(self.config))]

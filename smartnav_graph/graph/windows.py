@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,23 @@ class Window:
     @property
     def length_s(self) -> float:
         return (self.t1_ns - self.t0_ns) / 1e9
+
+
+Value = TypeVar("Value")
+
+
+class PerWindow(Generic[Value]):
+    """What a builder computed of windows alone, kept from pass to pass."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, tuple[Window, Value]] = {}
+
+    def of(self, window: Window, compute: Callable[[Window], Value]) -> Value:
+        """The value of a window, computed the first time."""
+        kept = self._kept.get(window.index)
+        if kept is None or kept[0] is not window:
+            kept = self._kept[window.index] = window, compute(window)
+        return kept[1]
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,8 @@ class Batch:
     _recent: gtsam.Values = field(default_factory=gtsam.Values)
 
     def __post_init__(self) -> None:
+        if self.initial_values is not None:
+            self.values = gtsam.Values(self.initial_values)
         self._stretch_s = (
             min(2.0, self.config.settle_s) if self.coarse_start else max(self.config.settle_s, self.first_s)
         )
@@ -103,12 +105,13 @@ class Batch:
     def update(self, update: GraphUpdate) -> None:
         """Take one update; solve the latest segment when it is long enough."""
         self.updates.append(update)
-        known = gtsam.Values() if self.initial_values is None else self.initial_values
         for name, state in update.session.items():
             if not self.values.exists(name):
-                self.values.insert(name, known.atVector(name) if known.exists(name) else state.initial)
+                self.values.insert(name, state.initial)
         if self.initial_values is not None:
-            copy_state(update, self.initial_values, self.values)
+            for name, initial in update.chain.items():
+                if not self.values.exists(name):
+                    self.values.insert(name, initial)
             return
         new = update.values()
         self.values.insert(new)
@@ -249,6 +252,8 @@ class Batch:
     def _solved(self, precision: SolveConfig) -> tuple[WholeGraph, Solve]:
         """Everything solved from the present values, which then are the solution."""
         graph, order = WholeGraph.of(self.updates), chronological_order(self.updates)
+        if self.initial_values is not None:
+            _keep_only(self.values, order)
         reintegrate = partial(_reintegrated, self.updates) if self.coarse_start else None
         solve = minimise(graph, self.values, order, precision, reintegrate)
         if not self.coarse_start and self._refresh(solve.values):
@@ -256,6 +261,14 @@ class Batch:
             solve = minimise(graph, solve.values, order, precision)
         self.values = solve.values
         return graph, solve
+
+
+def _keep_only(values: gtsam.Values, order: gtsam.Ordering) -> None:
+    """Erase states of an earlier pass that this one does not have."""
+    names = {order.at(i) for i in range(order.size())}
+    for name in values.keys():  # noqa: SIM118  gtsam.Values is no mapping
+        if name not in names:
+            values.erase(name)
 
 
 def _hold(update: GraphUpdate) -> gtsam.NonlinearFactor:

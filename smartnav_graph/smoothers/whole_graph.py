@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Indices
 from smartnav_graph.graph.robust import loss_weights, robust
-from smartnav_graph.graph.states import STATES, SessionState
+from smartnav_graph.graph.states import STATES, SessionState, letters_of
 from smartnav_graph.graph.update import FactorBatch, GraphUpdate, Measured, RowModel
 
 FixedStates = Mapping[int, Floats]
@@ -27,20 +27,38 @@ def value_of(values: gtsam.Values, letter: str, name: int) -> Floats:
 
 
 class Snapshot:
-    """States of gtsam.Values as arrays, each fetched once; held states at their constants. What stacks are
+    """States of gtsam.Values as arrays, all of a kind fetched at once; held states at their constants. What stacks are
     linearised to there is kept: a candidate whose cost was found is what the next step is taken from."""
 
     def __init__(self, values: gtsam.Values, held: FixedStates) -> None:
-        self.values = values
-        self._found: dict[int, Floats] = dict(held)
+        self.values, self.held = values, held
+        self._kinds: dict[str, tuple[NDArray[np.uint64], Floats]] = {}
         self._linear: dict[int, tuple[Floats, list[Floats]]] = {}
 
-    def column(self, letter: str, names: Sequence[int]) -> Floats:
-        """States (m, ...) of one kind."""
-        for name in names:
-            if name not in self._found:
-                self._found[name] = value_of(self.values, letter, name)
-        return np.array([self._found[name] for name in names])
+    def column(self, letter: str, names: NDArray[np.uint64]) -> Floats:
+        """States (m, ...) of one kind, all free or all held."""
+        if int(names[0]) in self.held:
+            return np.array([self.held[name] for name in names.tolist()])
+        if letter not in self._kinds:
+            self._kinds[letter] = self._of_kind(letter)
+        known, states = self._kinds[letter]
+        return np.asarray(states[np.searchsorted(known, names)])
+
+    @cached_property
+    def _names(self) -> NDArray[np.uint64]:
+        return np.array(self.values.keys(), dtype=np.uint64)
+
+    def _of_kind(self, letter: str) -> tuple[NDArray[np.uint64], Floats]:
+        """Keys and values of all states of a kind, sorted by key."""
+        names = self._names[letters_of(self._names) == ord(letter)]
+        if letter == "X":
+            rows = gtsam.utilities.extractPose3(self.values)  # rotation by rows, position
+            poses = np.tile(np.eye(4), (len(names), 1, 1))
+            poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+            return names, poses
+        if letter == "B":
+            return names, np.array([value_of(self.values, letter, name) for name in names.tolist()])
+        return names, np.asarray(gtsam.utilities.extractVectors(self.values, letter))
 
     def linearized(self, stack: StackedFactors) -> tuple[Floats, list[Floats]]:
         """Residuals and Jacobians of a stack."""
@@ -57,6 +75,7 @@ class StackedFactors:
         self.sensor = blocks[0].sensor
         self.loss = blocks[0].loss
         self.keys = [keys for block in blocks for keys in block.keys]
+        self._names = np.array(self.keys, dtype=np.uint64)
         self.loss_scale = np.repeat([block.loss_scale for block in blocks], [len(block.keys) for block in blocks])
         self.used = np.array([used for block in blocks for used in block.used], dtype=bool)
         self.data = np.concatenate([block.data for block in blocks])
@@ -84,7 +103,7 @@ class StackedFactors:
 
     def states(self, snapshot: Snapshot) -> list[Floats]:
         """The states (m, ...) of the rows, one array a letter of the model."""
-        columns = zip(self.model.letters, zip(*self.keys, strict=True), strict=True)
+        columns = zip(self.model.letters, self._names.T, strict=True)
         return [snapshot.column(letter, names) for letter, names in columns]
 
     def measured(self, values: gtsam.Values) -> Measured:

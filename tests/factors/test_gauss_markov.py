@@ -14,7 +14,7 @@ from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import GraphUpdate
-from smartnav_graph.graph.windows import Window
+from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import GnssNoise
 from smartnav_graph.simulation.fixes import gauss_markov
 from smartnav_graph.smoothers.whole_graph import WholeGraph, custom_factor
@@ -92,7 +92,7 @@ def chain(seconds: np.ndarray) -> gtsam.NonlinearFactorGraph:
     for k, t in enumerate(t_ns):
         update = GraphUpdate(k, int(t), t / NS)
         window = Window(k, int(t_ns[max(k - 1, 0)]), int(t), "normal", np.zeros(0), empty, empty)
-        add_correlated_error(update, window, State(k - 1, 0, None, None) if k else None, NOISE)
+        add_correlated_error(update, window, State(k - 1, 0, None, None) if k else None, NOISE, PerWindow())
         for _, factor in update.factors:
             graph.push_back(factor)
     return graph

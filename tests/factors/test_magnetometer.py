@@ -20,7 +20,7 @@ from smartnav_graph.factors.magnetometer import (
     MagnetometerBuilder,
     MagnetometerConfig,
     SeenField,
-    turned_mean,
+    TurnedSamples,
     unearthly,
 )
 from smartnav_graph.graph.pass_state import PassState, Phase
@@ -103,7 +103,7 @@ def test_the_mean_over_a_turn_is_the_field_at_its_end(rate):
     t = np.arange(0.05, 1.001, 0.1)
     attitudes = end @ exp(np.outer(t - 1.0, rate))
     seen = attitudes.transpose(0, 2, 1) @ NAV_FIELD + IRON
-    y, turn = turned_mean(turning(rate, bias=bias), ns_from_seconds(t), seen, bias)
+    y, turn = TurnedSamples.of(turning(rate, bias=bias), ns_from_seconds(t), seen).mean(bias)
     np.testing.assert_allclose(y, end.T @ NAV_FIELD + turn @ IRON, atol=1e-9)
     assert np.linalg.norm(turn, 2) <= 1.0 + 1e-12
 
@@ -112,7 +112,7 @@ def test_a_full_turn_takes_the_hard_iron_out():
     t = np.arange(1, 101) / 100
     attitudes = exp(np.outer(t, [0.0, 0.0, 2 * np.pi]))
     seen = attitudes.transpose(0, 2, 1) @ NAV_FIELD + IRON
-    _, turn = turned_mean(turning((0.0, 0.0, 2 * np.pi)), ns_from_seconds(t), seen, np.zeros(3))
+    _, turn = TurnedSamples.of(turning((0.0, 0.0, 2 * np.pi)), ns_from_seconds(t), seen).mean(np.zeros(3))
     np.testing.assert_allclose(turn, np.diag([0.0, 0.0, 1.0]), atol=1e-12)
 
 

@@ -114,8 +114,8 @@ class Standstills:
         """Sigma m/s of the zero velocity at a stamp; NaN in motion."""
         after = int(np.searchsorted(self.t_ns, t_ns))
         before = max(after - (after == len(self.t_ns) or self.t_ns[after] != t_ns), 0)
-        pair = self.speed_sigma[[before, min(after, len(self.t_ns) - 1)]]
-        return float(pair.max())  # NaN where either is
+        one, other = float(self.speed_sigma[before]), float(self.speed_sigma[min(after, len(self.t_ns) - 1)])
+        return np.nan if np.isnan(one + other) else max(one, other)
 
     def over(self, values: Floats, t0_ns: int, t1_ns: int) -> float:
         """Largest of `values` (n,) from t0 to t1; NaN where one is, or where there is no sample."""
