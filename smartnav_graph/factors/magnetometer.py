@@ -95,8 +95,8 @@ MODEL = AtKeyframe(SeenField())
 
 
 class TurnedSamples(NamedTuple):
-    """Samples (m, 3) of a window in body axes, to be seen from its end; step_s (m,) and angle (m, 3) rad, time to the next one, or the
-    window's end, and integral of the rate as read until then."""
+    """Samples (m, 3) of a window in body axes, to be seen from its end; step_s (m,) and angle (m, 3) rad, time to the
+    next one, or the window's end, and integral of the rate as read until then."""
 
     samples: Floats
     step_s: Floats

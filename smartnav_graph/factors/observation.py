@@ -94,8 +94,9 @@ class PartialPreintegration(NamedTuple):
     def columns(self, offset: float = 0.0) -> Floats:
         """The data columns that `AtInstant` appends to an observation's own; `offset` s is the nominal time offset
         already contained in the instant."""
+        parts: tuple[float | Floats, ...] = (*self, offset)
         columns, start = np.empty(WIDTH), 0
-        for part, width in zip([*self, offset], _AT.values(), strict=True):
+        for part, width in zip(parts, _AT.values(), strict=True):
             columns[start : start + width] = np.ravel(part)
             start += width
         return columns
