@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from smartnav_graph.core.arrays import Table
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import Origin
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.axes import find_body_axes
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix, fix_table
 from smartnav_graph.readers.samples import Samples, inertial_table, magnetic_table
@@ -17,6 +20,7 @@ from smartnav_graph.readers.source import build_session
 from smartnav_graph.session.session import Device, Session
 
 _log = logging.getLogger(__name__)
+SLOWEST_S = 1.0  # between inertial samples
 
 
 @dataclass
@@ -39,8 +43,14 @@ class LogParts:
                 known[reason] = known.get(reason, 0) + count
 
     def add_imu(self, gyro: Samples, accel: Samples) -> None:
-        """The stream ``imu`` of angular rate rad/s and specific force m/s^2."""
-        self.add("imu", gyro.file, *inertial_table(gyro, accel))
+        """The stream ``imu`` of angular rate rad/s and specific force m/s^2; none where rows are too far apart."""
+        table, counts = inertial_table(gyro, accel)
+        step = float(np.median(np.diff(table["t_ns"]))) / NS if len(table["t_ns"]) > 1 else np.inf
+        if step > SLOWEST_S:
+            reason = f"inertial, {step:.3g} s apart, left out: the motion between them is not known"
+            self.count("imu", {reason: len(table["t_ns"])})
+        else:
+            self.add("imu", gyro.file, table, counts)
 
     def add_magnetometer(self, field_ut: Samples) -> None:
         """The stream ``magnetometer`` of flux density uT."""
@@ -50,9 +60,10 @@ class LogParts:
         """A stream of one quantity, such as ``barometer`` with pressure_hpa."""
         self.add(stream, samples.file, {"t_ns": samples.t_ns, column: samples.values[:, 0]}, samples.counts)
 
-    def add_fixes(self, file: Path, fixes: LoggedFixes) -> None:
-        """The stream ``gnss``; none where no row has a position."""
+    def add_fixes(self, file: Path, fixes: LoggedFixes, skipped: Mapping[str, int] | None = None) -> None:
+        """The stream ``gnss``; none where no row has a position. `skipped` : lines of the file that were left out."""
         table, counts = fix_table(fixes)
+        counts |= skipped or {}
         if len(table["t_ns"]):
             self.add("gnss", file, table, counts)
         else:
@@ -82,7 +93,9 @@ def log_session(
         No stream, or a faulty one.
     """
     if not parts.tables:
-        raise SessionError(name, "holds no stream", "inertial samples or fixes", "switch these sensors on")
+        left_out = "; ".join(f"{n} rows {why}" for counts in parts.counts.values() for why, n in counts.items())
+        what = f"holds no stream ({left_out})" if left_out else "holds no stream"
+        raise SessionError(name, what, "inertial samples or fixes", "switch these sensors on")
     imu, fixes = (parts.tables[stream][1] if stream in parts.tables else None for stream in ("imu", "gnss"))
     if not up and imu is not None:
         found = find_body_axes(imu, fixes if fixes is not None and "lat_deg" in fixes else None)

@@ -104,7 +104,11 @@ def heading_of(path: Path, comments: str = "#") -> list[str]:
 def names_in_heading(heading: str, separator: str) -> list[str]:
     """Names of a heading, without quotes; columns without a name are called ``column 3``."""
     text = heading.lstrip("# ")
-    cells = text.split() if separator == " " else next(csv.reader([text], delimiter=separator, skipinitialspace=True))
+    try:
+        row = next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:  # no text at all
+        row = text.split(separator)
+    cells = text.split() if separator == " " else row
     names = [name.strip().strip('"').strip() for name in cells]
     return [name or f"column {i + 1}" for i, name in enumerate(names)]
 

@@ -114,7 +114,9 @@ class Session(Streams):
         """
         if self.imu is None or len(self.imu) < 2:
             rows = "no imu stream" if self.imu is None else f"imu has {len(self.imu)} rows"
-            raise SessionError(self.path or "session", rows, "at least two rows", "import imu.parquet", stream="imu")
+            left_out = "; ".join(f"{count} rows {reason}" for reason, count in self.dropped.get("imu", {}).items())
+            rows += f" ({left_out})" if left_out else ""
+            raise SessionError(self.path or "session", rows, "at least two rows", "record the IMU too", stream="imu")
         return self.imu
 
     @property

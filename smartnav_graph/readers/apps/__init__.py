@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from smartnav_graph.readers.apps import phyphox, sensor_logger, sensorlog, wide
+from smartnav_graph.readers.apps import flysight, gnss_logger, gopro, phyphox, sensor_logger, sensorlog, wide
 from smartnav_graph.readers.source import Reader
 
-APP_READERS: tuple[Reader, ...] = (sensor_logger.READER, phyphox.READER, sensorlog.READER, *wide.READERS.values())
+APP_READERS: tuple[Reader, ...] = (
+    sensor_logger.READER,
+    phyphox.READER,
+    sensorlog.READER,
+    *wide.READERS.values(),
+    gnss_logger.READER,
+    gopro.READER,
+    flysight.READER,
+)

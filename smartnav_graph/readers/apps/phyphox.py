@@ -121,7 +121,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         rows = table.rows(table.known(next(iter(table.cells))))
         role, values = _readings(name, rows)
         if role == "location":
-            parts.add_fixes(table.path, _fixes(rows, t_ns))
+            parts.add_fixes(table.path, _fixes(rows, t_ns), table.skipped)
         elif role == "barometer":
             parts.add_single("barometer", "pressure_hpa", read_vector(rows, t_ns, values, repairs))
         elif role and np.isfinite(values).all(axis=1).any():

@@ -86,7 +86,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
     location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
     if location is not None:
-        parts.add_fixes(location.path, _fixes(location))
+        parts.add_fixes(location.path, _fixes(location), location.skipped)
     device = about.get("device name") or about.get("devicename") or about.get("platform") or "Sensor Logger"
     return log_session(parts, repairs, name=device, epoch="unix")
 

@@ -185,7 +185,7 @@ def _add_fixes(channels: Channels, clock: _Clock, parts: LogParts) -> None:
     else:
         raise SessionError(table.path, "has fixes on another clock than the sensors", "loggingTime", "log it too")
     if known.any():
-        parts.add_fixes(table.path, fixes_of(channels_of(table.rows(known)), t_ns))
+        parts.add_fixes(table.path, fixes_of(channels_of(table.rows(known)), t_ns), table.skipped)
 
 
 READER = Reader(

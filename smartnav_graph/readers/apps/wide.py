@@ -194,7 +194,7 @@ def _read(app: WideApp, source: str, repairs: tuple[str, ...]) -> Session:
         if pressure is not None and np.isfinite(pressure).any():
             parts.add_single("barometer", "pressure_hpa", read_vector(channels.table, t_ns, pressure, repairs))
         if channels.has("lat", "lon"):
-            parts.add_fixes(channels.table.path, fixes_of(channels, t_ns))
+            parts.add_fixes(channels.table.path, fixes_of(channels, t_ns), channels.table.skipped)
     if gyro is None and force is not None:
         raise no_gyro(path, seen)
     if gyro is not None and force is None:

@@ -1,0 +1,175 @@
+"""Exports with faults: read as they are meant, or refused with an error that names the file; no traceback, no silent
+wrong number.
+
+A mutant that is read holds the readings of the export, or says in `dropped` what it left out.
+"""
+
+import random
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "apps"))
+from exports import ACCEL, EXPORTS, GYRO
+
+from smartnav_graph import readers
+from smartnav_graph.core.errors import SessionError
+
+
+def files_of(source):
+    return [source] if source.is_file() else sorted(file for file in source.rglob("*") if file.is_file())
+
+
+def cut(data, rng):
+    return data[: rng.randrange(len(data))]
+
+
+def lines_of(data):
+    return data.split(b"\n")
+
+
+def nan_cell(data, rng):
+    rows = lines_of(data)
+    row = rng.randrange(1, len(rows))
+    mark = rng.choice([b",", b";"])
+    cells = rows[row].split(mark)
+    cells[rng.randrange(len(cells))] = rng.choice([b"NaN", b"", b"N/A", b"null", b"x7", b"inf"])
+    rows[row] = mark.join(cells)
+    return b"\n".join(rows)
+
+
+def repeated_line(data, rng):
+    rows = lines_of(data)
+    row = rng.randrange(1, max(len(rows) - 1, 2))
+    return b"\n".join([*rows[: row + 1], *rows[row:]])
+
+
+def swapped_lines(data, rng):
+    rows = lines_of(data)
+    row = rng.randrange(len(rows) // 2, max(len(rows) - 2, len(rows) // 2 + 1))
+    rows[row], rows[row - 1] = rows[row - 1], rows[row]
+    return b"\n".join(rows)
+
+
+def missing_line(data, rng):
+    rows = lines_of(data)
+    del rows[rng.randrange(len(rows))]
+    return b"\n".join(rows)
+
+
+def swapped_columns(data, rng):
+    rows = [row.split(b",") for row in lines_of(data)]
+    width = max(map(len, rows))
+    i, j = rng.randrange(width), rng.randrange(width)
+    for row in rows:
+        if len(row) > max(i, j):
+            row[i], row[j] = row[j], row[i]
+    return b"\n".join(b",".join(row) for row in rows)
+
+
+def missing_column(data, rng):
+    rows = [row.split(b",") for row in lines_of(data)]
+    column = rng.randrange(max(map(len, rows)))
+    return b"\n".join(b",".join(c for i, c in enumerate(row) if i != column) for row in rows)
+
+
+def decimal_commas(data, rng):
+    return re.sub(rb"(\d)\.(\d)", rb"\1,\2", data)
+
+
+def decimal_commas_and_semicolons(data, rng):
+    return re.sub(rb"(\d)\.(\d)", rb"\1,\2", data.replace(b",", b";"))
+
+
+MUTATIONS = {
+    "cut": cut,
+    "nan": nan_cell,
+    "repeated line": repeated_line,
+    "swapped lines": swapped_lines,
+    "missing line": missing_line,
+    "swapped columns": swapped_columns,
+    "missing column": missing_column,
+    "decimal commas": decimal_commas,
+    "semicolons": decimal_commas_and_semicolons,
+    "mark": lambda data, rng: b"\xef\xbb\xbf" + data,
+    "CRLF": lambda data, rng: data.replace(b"\n", b"\r\n"),
+    "CR": lambda data, rng: data.replace(b"\n", b"\r"),
+    "UTF-16": lambda data, rng: data.decode("utf-8", errors="replace").encode("utf-16"),
+    "code page": lambda data, rng: data.decode("utf-8", errors="replace").encode("cp1252", errors="replace"),
+    "capitals": lambda data, rng: lines_of(data)[0].upper() + data[len(lines_of(data)[0]) :],
+    "heading again": lambda data, rng: data + lines_of(data)[0] + b"\n",
+    "sep line": lambda data, rng: b"sep=,\n" + data,
+    "empty": lambda data, rng: b"",
+    "heading only": lambda data, rng: lines_of(data)[0] + b"\n",
+    "zeros": lambda data, rng: data[: len(data) // 2] + b"\0" * 64 + data[len(data) // 2 :],
+    "noise": lambda data, rng: bytes(rng.randrange(256) for _ in range(200)),
+    "no line end": lambda data, rng: data.rstrip(b"\n"),
+}
+
+
+def attempt(source):
+    """The session of a source, or the text of the error."""
+    try:
+        return readers.read(source), ""
+    except SessionError as error:
+        return None, str(error)
+
+
+def run(name, mutation, seed, tmp_path):
+    file, write = EXPORTS[name]
+    source = write(tmp_path / file)
+    original = readers.read(source)
+    rng = random.Random(f"{name} {mutation} {seed}")
+    mutated = rng.choice([f for f in files_of(source) if f.stat().st_size])
+    mutated.write_bytes(MUTATIONS[mutation](mutated.read_bytes(), rng))
+    return source, original, mutated
+
+
+# A byte among the numbers of a binary file may be any: nothing shows that it is another.
+BINARY = ("cut", "zeros", "empty", "noise", "mark")
+CASES = [(name, mutation) for name in EXPORTS for mutation in (BINARY if name == "gopro" else MUTATIONS)]
+
+
+@pytest.mark.parametrize(("name", "mutation"), CASES)
+def test_a_faulty_export_is_read_rightly_or_refused(tmp_path, name, mutation):
+    check_mutant(name, mutation, 0, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPORTS)
+def test_two_hundred_faulty_exports(tmp_path, name):
+    mutations = [mutation for other, mutation in CASES if other == name]
+    for seed in range(1, 200 // len(mutations) + 2):
+        for mutation in mutations:
+            check_mutant(name, mutation, seed, tmp_path / f"{seed} {mutation}")
+
+
+def check_mutant(name, mutation, seed, folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    source, original, mutated = run(name, mutation, seed, folder)
+    session, error = attempt(source)
+    if session is None:
+        assert source.name in error or mutated.name in error, f"{mutation}: names no file: {error}"
+        return
+    if session.imu is None:
+        return
+    assert len(session.imu) <= len(original.imu), mutation
+    gyro, accel = session.imu.gyro, session.imu.accel
+    right = np.isclose(gyro, GYRO, atol=3e-4).all(axis=1) & np.isclose(accel, ACCEL, atol=2e-3).all(axis=1)
+    assert right.all(), f"{name}, {mutation} {seed} of {mutated.name}: {gyro[~right][0]}, {accel[~right][0]}"
+
+
+@pytest.mark.parametrize("name", [name for name in EXPORTS if name in ("sensor-logger", "phyphox")])
+def test_one_sensor_missing(tmp_path, name):
+    file, write = EXPORTS[name]
+    for missing in files_of(write(tmp_path / file)):
+        source = write(tmp_path / f"without {missing.stem}" / file)
+        (source / missing.relative_to(tmp_path / file)).unlink()
+        session, error = attempt(source)
+        if session is None:
+            assert str(source) in error
+            continue
+        assert np.allclose(session.imu.accel, ACCEL, atol=1e-6) and np.allclose(session.imu.gyro, GYRO, atol=1e-9)
