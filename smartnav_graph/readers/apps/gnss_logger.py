@@ -161,9 +161,7 @@ def _vector(log: _Log, kinds: tuple[str, str], offset: int, repairs: tuple[str, 
     stamp = "elapsedrealtimenanos" if "elapsedrealtimenanos" in table.cells else "utctimemillis"
     table.require([stamp])
     table = table.rows(table.known(stamp))
-    axes = {
-        found[1]: name for name in table.cells if (found := re.search(r"^(.*?[xyz])(mps2|radpersec|microt)?$", name))
-    }
+    axes = {re.sub(r"(mps2|radpersec|microt)$", "", name): name for name in table.cells}
     readings = [axes.get(f"{found[0].lower()}{axis}") for axis in "xyz"]
     biases = [axes.get(f"bias{axis}", axes.get(f"drift{axis}")) for axis in "xyz"]
     columns = [name for name in readings if name is not None]
