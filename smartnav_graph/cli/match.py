@@ -17,13 +17,14 @@ from smartnav_graph.cli.options import Reporting, SourceName, Switch, Text, name
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
 from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.readers import match_file
 from smartnav_graph.readers.reference import load_reference
 from smartnav_graph.session import folder as session_folder
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
 from smartnav_graph.vision import benchmark as scores
 from smartnav_graph.vision import features as kinds
-from smartnav_graph.vision import match_file, match_store
+from smartnav_graph.vision import match_store
 from smartnav_graph.vision.benchmark import Published, Score
 from smartnav_graph.vision.front_end import FrontEndConfig
 from smartnav_graph.vision.map import SOURCE, KnownPositions, map_pose_fixes, own_fixes

@@ -20,6 +20,7 @@ from smartnav_graph.estimate.replay import replay
 from smartnav_graph.estimate.run import Run, smooth
 from smartnav_graph.evaluation import Evaluation, evaluate
 from smartnav_graph.output.export import export, export_pictures
+from smartnav_graph.output.export.smartnav_logger import write_smartnav
 from smartnav_graph.output.run_folder import StoredRun, check_out, read_run, write_run
 from smartnav_graph.output.summary_json import table_of, text_of
 from smartnav_graph.session.calibration import model as calibration_model
@@ -105,15 +106,20 @@ class Export(Writing):
     """
 
     run_path: RunPath
-    """Run folder."""
-    format: Literal["tum", "kml", "geojson", "gpx", "csv", "images"]
-    """The format; kml, geojson, gpx and images need an origin."""
+    """Run folder; for smartnav a session."""
+    format: Literal["tum", "kml", "geojson", "gpx", "csv", "images", "smartnav"]
+    """The format; kml, geojson, gpx and images need an origin. smartnav: the files of the logger of 2012."""
     solution: Literal["smoothed", "causal"] = "smoothed"
     """Solution of a replay."""
     session: Annotated[Path | None, tyro.conf.arg(metavar="SESSION")] = None
     """For images: the session, if it was moved."""
 
     def run(self) -> None:
+        if self.format == "smartnav":
+            unwritten = write_smartnav(readers.load(self.run_path), self.out, force=self.force)
+            left_out = ", ".join(f"{name} {rows}" for name, rows in unwritten.items())
+            print(f"smartnav: {self.out}" + (f"; without {left_out}" if left_out else ""))
+            return
         run = read_run(self.run_path)
         if self.format == "images":
             self._pictures(run)

@@ -20,6 +20,7 @@ from smartnav_graph.readers import (
     indoor_waypoints,
     kitti_odometry,
     pyshoe,
+    smartnav_logger,
     tyrex,
 )
 from smartnav_graph.readers.apps import APP_READERS
@@ -46,6 +47,7 @@ READERS: dict[str, Reader] = {
         colmap.READER,
         *APP_READERS,
         csv_folder.READER,
+        smartnav_logger.READER,
         nmea.READER,
         gpx.READER,
         rtklib.READER,

@@ -49,7 +49,7 @@ def save(session: Session, path: str | Path, *, force: bool = False, progress: P
         _copy_pictures(session, folder / PICTURES, progress)
         if session.write_pictures is not None:
             session.write_pictures(folder / PICTURES)
-        (folder / "session.toml").write_text(tomli_w.dumps(_header(session)), encoding="utf-8")
+        (folder / "session.toml").write_text(tomli_w.dumps(header_of(session)), encoding="utf-8")
 
 
 def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
@@ -62,7 +62,8 @@ def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
             shutil.copy2(source, folder / file)
 
 
-def _header(session: Session) -> dict[str, object]:
+def header_of(session: Session) -> dict[str, object]:
+    """The tables of session.toml."""
     header: dict[str, object] = {"schema": SCHEMA}
     if session.gravity_m_s2 is not None:
         header["gravity_m_s2"] = session.gravity_m_s2
@@ -97,9 +98,9 @@ def build_stream(
         raise SessionError(where, f"a column holds no numbers ({error})", "numbers", stream=kind.NAME) from error
 
 
-def read_header(folder: Path) -> dict[str, Any]:
-    """session.toml as keyword arguments of Session (without streams)."""
-    path = folder / "session.toml"
+def read_header(folder: Path, name: str = "session.toml") -> dict[str, Any]:
+    """session.toml, or a file of the same keys, as keyword arguments of Session (without streams)."""
+    path = folder / name
     if not path.exists():
         raise SessionError(folder, "holds no session.toml", "a session folder", "make one with `smartnav import`")
     raw = read_toml(path, SessionError, "a session.toml")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.readers import match_file
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.streams import Images
-from smartnav_graph.vision import match_file
 
 # the camera of 2012: Brown's distortion with five coefficients
 CAMERA = Camera(3264, 2448, 2935.64, 2944.08, 1619, 1234, distortion=(0.228, -0.973, -2.32e-4, -1.29e-3, 0.951))

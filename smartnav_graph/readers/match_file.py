@@ -117,6 +117,13 @@ def of_images(matches: Matches, image_ids: NDArray[np.int64]) -> NDArray[np.bool
     return np.isin(matches.image_id_0, image_ids) & np.isin(matches.image_id_1, image_ids)
 
 
+def on_sensor(matches: Matches, camera: Camera) -> NDArray[np.bool_]:
+    """Which matches (n,) have both points on the sensor: noise may move those at its edges beyond it."""
+    pitch, centre = _pitch_and_centre(camera)
+    um = np.abs([(camera.pixels(xy) - centre) * pitch for xy in (matches.xy0_n, matches.xy1_n)])
+    return np.asarray((um <= SENSOR_UM / 2.0).all(axis=(0, 2)))
+
+
 def write_match_file(matches: Matches, path: str | Path, camera: Camera, *, force: bool = False) -> None:
     """Write matches of one camera as a match file: times with nine decimal places, coordinates with three.
 
