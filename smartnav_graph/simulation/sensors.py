@@ -50,6 +50,8 @@ PROFILES: dict[str, ImuNoise] = {
     # The same phone as it warms up: its gyro was seen to drift in proportion to temperature, through zero at 40 of 33
     # to 48 deg C. 1e-4 rad/s/sqrt(s) is 3.5e-3 rad/s in 20 min; the published bias is 4.9e-3.
     "galaxy-s2-warming": replace(_GALAXY_S2, gyro_bias_walk=1e-4),
+    # The same phone where its temperature is simulated beside: the bias is that of the temperature, and little more.
+    "galaxy-s2-by-temperature": replace(_GALAXY_S2, gyro_bias_sigma=2e-4, gyro_bias_walk=1e-6),
     "galaxy-s5": _at_rest((4.6 * _MILLI_G, 6.1 * _MILLI_G, 0.2 * _MILLI_G), (1.7e-3, 2.8e-3, 0.9e-3), 0.2, 3.0e-3),
     "iphone-4": _at_rest((2.8 * _MILLI_G, 2.4 * _MILLI_G, 4.2 * _MILLI_G), (4.8e-3, 3.2e-3, 4.3e-3), 0.2, 5.0e-3),
 }

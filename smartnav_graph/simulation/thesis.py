@@ -40,7 +40,7 @@ _STATIC = Scenario(
     "thesis-static",
     6 * 3600.0,
     flat,
-    profile="galaxy-s2",
+    profile="galaxy-s2-by-temperature",
     magnetometer=MagnetometerModel(rate_hz=100.0),
     temperature=TemperatureModel(),
 )
