@@ -19,11 +19,11 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.core.timebase import Gap
+from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors import gap_error, imu_intrinsics
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gap_model import Bridge
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
@@ -42,6 +42,8 @@ KEPT_BIAS = 0.1 * STALE_BIAS
 # of two or so (its logarithm has sigma 1 / sqrt(2 nu) = 0.5), that of a calibrated device to 7 %.
 CLASS_WEIGHT = 2.0
 CALIBRATED_WEIGHT = 100.0
+# Factor on the noise known before that its own samples must show to be taken instead.
+NOISIER = 1.5
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,11 @@ class ImuBuilder(Builder):
         """The noise between samples over that of `noise`, of accelerometer and gyroscope."""
         accel, gyro = self.sampling_noise
         return {"accel": accel / self.noise.accel_noise_density, "gyro": gyro / self.noise.gyro_noise_density}
+
+    def prior_scales(self) -> dict[str, float]:
+        """Scales of the noise before anything is estimated: of groups whose samples alone are noisier than known."""
+        known = self.sampling_scales() if self.config.estimate_noise else {}
+        return {name: scale for name, scale in known.items() if scale > NOISIER}
 
     def params(self, pass_state: PassState, bridge: Bridge | None = None) -> gtsam.PreintegrationParams:
         """Preintegration parameters in continuous-time units; nav z up."""
@@ -306,5 +313,6 @@ def build(context: FactorContext) -> ImuBuilder:
     known = noise != DEVICE_CLASSES[context.calibration.device_class]
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
     gravity, options = context.session.gravity, context.options(ImuConfig)
-    own = sampling_noise(context.session.require_imu())
+    imu = context.session.require_imu()
+    own = sampling_noise(imu.take(imu.t_ns <= imu.t_ns[0] + round(INITIALISATION_S * NS)) if context.causal else imu)
     return ImuBuilder(noise, gravity, context.gaps, context.bridges, options, weight=weight, sampling_noise=own)

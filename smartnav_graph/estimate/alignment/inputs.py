@@ -17,6 +17,7 @@ from smartnav_graph.estimate.alignment.multilateration import multilaterate
 from smartnav_graph.estimate.alignment.pedestrian import SPARSE_S, Walk, walked
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.magnetometer import IRON, MagnetometerBuilder
 from smartnav_graph.factors.pedestrian import StepBuilder
 from smartnav_graph.factors.pose_fix import AttitudeBuilder
@@ -99,11 +100,17 @@ def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
     return attitude_start(problem.session.require_imu(), start, stream.t_ns[rows], nav_R_body, sigma)
 
 
+def _known_noise(problem: Problem) -> PassState:
+    imu = one_of(problem.builders, ImuBuilder)
+    return PassState() if imu is None else PassState(noise_scales=imu.prior_scales())
+
+
 def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
+    known = _known_noise(problem)
     builder, phase = one_of(problem.builders, MagnetometerBuilder), Phase.CAUSAL if causal else Phase.PLAIN
     stream = problem.session.magnetometer
     if builder is None or stream is None:
-        return {}
+        return {"pass_state": known}
     start = field_start(
         problem.session.require_imu(),
         stream,
@@ -113,7 +120,7 @@ def _north(problem: Problem, *, causal: bool) -> dict[str, Any]:
         builder.iron_sigma,
         builder.declination,
     )
-    found = PassState() if start is None else PassState(aligned_states={IRON: (start.iron, start.iron_sigma)})
+    found = known if start is None else replace(known, aligned_states={IRON: (start.iron, start.iron_sigma)})
     return {
         "magnetometer": stream,
         "declination_deg": problem.session.declination_deg,

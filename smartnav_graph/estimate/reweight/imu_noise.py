@@ -26,7 +26,7 @@ from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.factors import imu_intrinsics
-from smartnav_graph.factors.imu import ImuBuilder, accel_part, integration_part
+from smartnav_graph.factors.imu import CLASS_WEIGHT, ImuBuilder, accel_part, integration_part
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.graph.windows import Window
@@ -39,7 +39,7 @@ LEAST_REDUNDANCY = 4.0
 MOST = 5.0
 # No device is a factor of more than this from what is known of its class, or of more than the second from the noise
 # between its samples, where that is larger.
-WIDEST, WIDEST_OF_SAMPLES = 10.0, 3.0
+WIDEST, WIDEST_OF_SAMPLES = 10.0, 5.0
 # Factor on either beyond which something else may be what makes the noise appear so.
 WORSE = 2.5
 # Normalised square at which fixes contradict their sigma.
@@ -69,16 +69,18 @@ class Component(NamedTuple):
         """Whether the data say enough of this group: by their number, or by how far off they are."""
         return self.redundancy >= LEAST_REDUNDANCY or self.square > chi2.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
 
-    def scale(self, before: float, weight: float, most: float = WIDEST, level: float = 1.0) -> float:
+    def scale(
+        self, before: float, weight: float, most: float = WIDEST, level: float = 1.0, prior: float = 1.0
+    ) -> float:
         """The next scale of the group's sigma, at most `most`.
 
-        weight : what the noise known before (scale 1) counts for; level : normalised square of the fixes with sigmas of
+        weight : what the noise known before (scale `prior`) counts for; level : normalised square of the fixes with sigmas of
         their own. Where they contradict these more than the group does, they bend the solution, and the noise is not to
         blame.
         """
         blamed = level < CONTRADICTION or self.square > level * self.redundancy
         square = self.square if blamed else min(self.square, self.redundancy)
-        wanted = np.sqrt((before**2 * square + weight) / (self.redundancy + weight))
+        wanted = np.sqrt((before**2 * square + weight * prior**2) / (self.redundancy + weight))
         if abs(np.log(wanted / before)) < 0.2 / np.sqrt(2.0 * (self.redundancy + weight)):
             return before  # a fifth of what the data leave open
         step = np.clip((wanted / before) ** RELAXATION, 1.0 / MOST, MOST)
@@ -196,10 +198,11 @@ def noise_scales(
     builder = next((b for b in builders if isinstance(b, ImuBuilder) and b.config.estimate_noise), None)
     if builder is None or len(windows) < 2:
         return {}
-    known = builder.sampling_scales()
+    known, prior = builder.sampling_scales(), builder.prior_scales()
     most = {name: max(WIDEST, WIDEST_OF_SAMPLES * known.get(name, 0.0)) for name in NOISE_NAMES}
+    weight = {name: CLASS_WEIGHT if name in prior else builder.weight for name in NOISE_NAMES}
     return {
-        name: part.scale(pass_state.scale(name), builder.weight, most[name], level)
+        name: part.scale(pass_state.scale(name), weight[name], most[name], level, prior.get(name, 1.0))
         for name, part in components(builder, windows, estimate, pass_state).items()
         if part.is_known
     }

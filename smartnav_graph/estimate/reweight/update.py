@@ -109,7 +109,8 @@ def _update_noise_and_fixes(
         outliers = {name: rows - trusted.get(name, frozenset()) for name, rows in outliers.items()}
         trusted = {name: rows | pass_state.trusted.get(name, frozenset()) for name, rows in trusted.items()}
         new = replace(new, phase=Phase.GATED, rejected=outliers, weights={}, robust_floor_m=0.0)
-        return replace(new, trusted=trusted, noise_scales={}), False
+        imu = one_of(builders, ImuBuilder)
+        return replace(new, trusted=trusted, noise_scales={} if imu is None else imu.prior_scales()), False
     if pass_state.phase in (Phase.ROBUST, Phase.GRADUATED):
         weighed = _next_gnc(tested, pass_state)
         if weighed is not None:

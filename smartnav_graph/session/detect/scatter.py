@@ -11,7 +11,8 @@ and a low quantile of the normalised squares gives sigma, whatever outliers ther
 leaves the same sigma, motion a larger one; and neighbouring r of white noise are of opposite sign (their correlation is
 -0.8), those of a motion are not. Fixes too far apart follow no motion, and their scatter is an upper bound.
 
-Inertial samples: their second differences hold the noise and vibration that a recording at this rate cannot follow.
+Inertial samples: at high frequencies their spectrum is that of the white noise; vibration and motion have peaks, which a
+low quantile over the frequencies leaves out (Welch 1967, IEEE Trans. Audio Electroacoust. 15(2)).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import welch
 from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
@@ -33,6 +35,8 @@ AGREES = 0.999
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
 # and longest median spacing.
 NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
+# Samples of one piece of the spectrum, pieces at least, and the frequencies looked at, as a share of the rate.
+SPECTRUM_ROWS, LEAST_PIECES, HIGH_FREQUENCY = 256, 8, 0.1
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,16 @@ def _sigma(residual: Floats) -> float:
 
 
 def sampling_noise(imu: Imu) -> tuple[float, float]:
-    """Density of the noise between inertial samples, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz), of the worst axis: that of
-    white noise with the median square of their second differences."""
-    if len(imu) < LEAST_FIXES:
+    """Density of the white noise of inertial samples, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz), mean square of the axes; zeros
+    where there are too few."""
+    if len(imu) < LEAST_PIECES * LEAST_FIXES:
         return 0.0, 0.0
-    step_s = float(np.median(np.diff(imu.t_ns))) / NS
-    square = [np.median(np.diff(x, 2, axis=0) ** 2, axis=0).max() for x in (imu.accel, imu.gyro)]
-    accel, gyro = (float(np.sqrt(x / 6.0 / chi2(1).median() * step_s)) for x in square)
-    return accel, gyro
+    rate_hz = NS / float(np.median(np.diff(imu.t_ns)))
+    rows = min(SPECTRUM_ROWS, len(imu) // LEAST_PIECES)
+
+    def density(values: Floats) -> float:
+        frequency, power = welch(values, rate_hz, nperseg=rows, detrend="linear", average="median", axis=0)
+        floor = np.quantile(power[frequency > HIGH_FREQUENCY * rate_hz], QUANTILE, axis=0)
+        return float(np.sqrt(0.5 * floor.mean()))
+
+    return density(imu.accel), density(imu.gyro)
