@@ -36,7 +36,7 @@ AGREES = 0.999
 # and longest median spacing.
 NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
 # Samples of one piece of the spectrum, pieces at least, and the frequencies looked at, as a share of the rate.
-SPECTRUM_ROWS, LEAST_PIECES, HIGH_FREQUENCY = 256, 8, 0.1
+SPECTRUM_ROWS, LEAST_PIECES, HIGH_FREQUENCY = 64, 8, 0.1
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import pytest
 
 from smartnav_graph.session.detect.scatter import (
     LEAST_FIXES,
+    LEAST_PIECES,
     agrees_with_neighbours,
     normalised_residuals,
     sampling_noise,
@@ -93,4 +94,15 @@ def test_the_noise_between_inertial_samples_is_a_density_whatever_the_rate(hertz
     accel, gyro = 0.03 * np.sqrt(hertz) * rng.normal(size=(n, 3)), 0.002 * np.sqrt(hertz) * rng.normal(size=(n, 3))
     imu = Imu(t_ns=stamps(n, 1.0 / hertz), accel=accel + 0.01 * t[:, None], gyro=gyro + 1.0)
     assert sampling_noise(imu) == pytest.approx((0.03, 0.002), rel=0.1)
-    assert sampling_noise(imu.take(slice(0, LEAST_FIXES - 1))) == (0.0, 0.0)
+    assert sampling_noise(imu.take(slice(0, LEAST_PIECES * LEAST_FIXES - 1))) == (0.0, 0.0)
+
+
+def test_vibration_of_an_engine_and_steps_are_no_white_noise() -> None:
+    """Harmonics of 1 and 0.5 m/s^2 and a walk's bounce, in white noise of 0.01 m/s^2/sqrt(Hz)."""
+    rng, n = np.random.default_rng(8), 6000
+    t = np.arange(n) / 100.0
+    shaken = np.sin(2 * np.pi * 27.0 * t) + 0.5 * np.sin(2 * np.pi * 41.0 * t) + 3.0 * np.sin(2 * np.pi * 1.8 * t)
+    imu = Imu(
+        t_ns=stamps(n, 0.01), accel=0.1 * rng.normal(size=(n, 3)) + shaken[:, None], gyro=0.01 * rng.normal(size=(n, 3))
+    )
+    assert sampling_noise(imu) == pytest.approx((0.01, 0.001), rel=0.15)
