@@ -11,8 +11,8 @@ and a low quantile of the normalised squares gives sigma, whatever outliers ther
 leaves the same sigma, motion a larger one; and neighbouring r of white noise are of opposite sign (their correlation is
 -0.8), those of a motion are not. Fixes too far apart follow no motion, and their scatter is an upper bound.
 
-Inertial samples: at high frequencies their spectrum is that of the white noise; vibration and motion have peaks, which a
-low quantile over the frequencies leaves out (Welch 1967, IEEE Trans. Audio Electroacoust. 15(2)).
+Inertial samples: at high frequencies their spectrum is that of the white noise; vibration and motion have peaks, which
+a low quantile over the frequencies leaves out (Welch 1967, IEEE Trans. Audio Electroacoust. 15(2)).
 """
 
 from __future__ import annotations
