@@ -74,9 +74,9 @@ class Component(NamedTuple):
     ) -> float:
         """The next scale of the group's sigma, at most `most`.
 
-        weight : what the noise known before (scale `prior`) counts for; level : normalised square of the fixes with sigmas of
-        their own. Where they contradict these more than the group does, they bend the solution, and the noise is not to
-        blame.
+        weight : what the noise known before (scale `prior`) counts for; level : normalised square of the fixes with
+        sigmas of their own. Where they contradict these more than the group does, they bend the solution, and the noise
+        is not to blame.
         """
         blamed = level < CONTRADICTION or self.square > level * self.redundancy
         square = self.square if blamed else min(self.square, self.redundancy)
