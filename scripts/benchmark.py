@@ -6,6 +6,8 @@ batch-37min       simulated drive of 37 min in memory -> solution with 15x15 cov
                   clock offset) and no vehicle constraint; baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
 batch-37min-full  the same with everything on: no calibration, fixes without sigmas, correlated errors, noise found,
                   clock offset, vehicle constraint; baseline as above
+batch-4hz-full    the same of a drive of 9 min with fixes at 4 Hz, barometer and magnetometer; baseline: bare_gtsam.py
+                  9 imu 4, at the same keyframes
 batch-2h          two hours, as batch-37min; baseline: batch-37min
 replay-fixed-lag  99 % of the update times (wall seconds) on the KITTI drive that comes with gtsam, lag 10 s;
                   baseline: scripts/bare_fixed_lag.py
@@ -57,8 +59,8 @@ def python(*arguments: str) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def bare(factor: str) -> Measured:
-    result = python(str(HERE / "bare_gtsam.py"), str(MINUTES), factor)
+def bare(factor: str, minutes: int = MINUTES, fixes_hz: int = 1) -> Measured:
+    result = python(str(HERE / "bare_gtsam.py"), str(minutes), factor, str(fixes_hz))
     return Measured(result["total_s"], None, {key: result[key] for key in ("cpu_s", "iterations")})
 
 
@@ -241,6 +243,22 @@ def make_session(scenario: str, folder: Path, *, sigmas: bool = True) -> str:
     return str(path)
 
 
+def make_4hz_session(folder: Path) -> str:
+    """A simulated drive of 9 min without any sigma: fixes at 4 Hz, barometer, uncalibrated magnetometer."""
+    path = folder / "car-4hz"
+    code = (
+        "import sys, dataclasses, smartnav_graph as sn\n"
+        "from smartnav_graph.simulation.scenarios import find_scenario\n"
+        "car, phone = find_scenario('car-10min'), find_scenario('car-all-2min')\n"
+        "gnss = dataclasses.replace(car.gnss, rate_hz=4.0)\n"
+        "sensors = dict(magnetometer=phone.magnetometer, barometer=phone.barometer)\n"
+        "s = dataclasses.replace(car, seconds=540.0, gnss=gnss, **sensors)(0, calibrated=False)\n"
+        "sn.save(s.replace(gnss=dataclasses.replace(s.gnss, sigma=None)), sys.argv[1])"
+    )
+    subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+    return str(path)
+
+
 def make_run(session: str, folder: Path) -> str:
     """A run on disk, without report and recording."""
     path = folder / "run"
@@ -265,12 +283,15 @@ Job = Callable[[], Measured]
 
 def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
     """What is measured, its baseline, and what is only reported beside them."""
-    plain = make_session(f"car-{MINUTES}min", folder) if name.startswith("batch") else ""
+    plain = make_session(f"car-{MINUTES}min", folder) if name in ("batch-37min", "batch-2h") else ""
     if name == "batch-37min":
         return lambda: ours("batch", plain), lambda: bare("imu"), {"bare_combined": lambda: bare("combined")}
     if name == "batch-37min-full":
         unknown = make_session(f"car-{MINUTES}min", folder, sigmas=False)
         return lambda: ours("full", unknown), lambda: bare("imu"), {"bare_combined": lambda: bare("combined")}
+    if name == "batch-4hz-full":
+        fast = make_4hz_session(folder)
+        return lambda: ours("full", fast), lambda: bare("imu", 9, 4), {}
     if name == "batch-2h":
         long = make_session("car-2h", folder)
         return lambda: ours("batch", long), lambda: ours("batch", plain), {}
@@ -312,7 +333,7 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
 
 
 NAMES = (
-    *("batch-37min", "batch-37min-full", "batch-2h", "replay-fixed-lag"),
+    *("batch-37min", "batch-37min-full", "batch-4hz-full", "batch-2h", "replay-fixed-lag"),
     *("vision-frontend", "two-view", "vision-solve", "recording-37min"),
 )
 
