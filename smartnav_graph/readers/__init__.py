@@ -26,7 +26,7 @@ from smartnav_graph.readers import (
 from smartnav_graph.readers.apps import APP_READERS
 from smartnav_graph.readers.archive import is_archive, unpacked
 from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
-from smartnav_graph.readers.robotics import ros, ulog
+from smartnav_graph.readers.robotics import kf_gins, kitti_raw, ros, ulog, vectornav
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.unknown import describe_unknown
 from smartnav_graph.session import folder as session_folder
@@ -55,6 +55,9 @@ READERS: dict[str, Reader] = {
         listed.CONTROL,
         ros.READER,
         ulog.READER,
+        vectornav.READER,
+        kf_gins.READER,
+        kitti_raw.READER,
     )
 }
 

@@ -60,9 +60,12 @@ class LogParts:
         """A stream of one quantity, such as ``barometer`` with pressure_hpa."""
         self.add(stream, samples.file, {"t_ns": samples.t_ns, column: samples.values[:, 0]}, samples.counts)
 
-    def add_fixes(self, file: Path, fixes: LoggedFixes, skipped: Mapping[str, int] | None = None) -> None:
-        """The stream ``gnss``; none where no row has a position. `skipped` : lines of the file that were left out."""
-        table, counts = fix_table(fixes)
+    def add_fixes(
+        self, file: Path, fixes: LoggedFixes, skipped: Mapping[str, int] | None = None, *, may_repeat: bool = False
+    ) -> None:
+        """The stream ``gnss``; none where no row has a position. `skipped` : lines of the file that were left out;
+        `may_repeat` : see `fix_table`."""
+        table, counts = fix_table(fixes, may_repeat=may_repeat)
         counts |= skipped or {}
         if len(table["t_ns"]):
             self.add("gnss", file, table, counts)

@@ -149,4 +149,5 @@ def clock_offset(from_ns: Times, to_ns: Times) -> int:
 
     The median of the differences: a reading that was written late does not count.
     """
-    return int(np.median(to_ns - from_ns))
+    apart = to_ns - from_ns
+    return int(apart[0]) + int(np.median(apart - apart[0]))  # no float holds the nanoseconds of an epoch

@@ -18,13 +18,14 @@ from smartnav_graph.core.arrays import Floats, Mask, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.timebase import NS, seconds_since
-from smartnav_graph.readers.axes import BodyAxes, find_body_axes
+from smartnav_graph.readers.axes import BodyAxes
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix
 from smartnav_graph.readers.log_session import LogParts, log_session
+from smartnav_graph.readers.robotics.device_axes import device_axes
 from smartnav_graph.readers.robotics.ros_bag import IMAGES, Topic, read_topics, suffix_of
 from smartnav_graph.readers.robotics.ros_images import image_table, write_bag_pictures
 from smartnav_graph.readers.robotics.sensor_choice import check_sensor_names, select_sensor, split_source
-from smartnav_graph.readers.samples import Samples, carried, in_time_order
+from smartnav_graph.readers.samples import Samples, carried, clock_offset, in_time_order
 from smartnav_graph.readers.source import Reader, vector_columns
 from smartnav_graph.session.session import Session
 
@@ -57,7 +58,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if imus:
         parts.add_imu(*_inertial(clock, imus, names))
     if found := _of(topics, "sensor_msgs/msg/NavSatFix"):
-        parts.add_fixes(path, _fixes(clock, select_sensor(path, "fixes", found, names)))
+        parts.add_fixes(path, _fixes(clock, select_sensor(path, "fixes", found, names)), may_repeat=True)
     if found := _of(topics, "sensor_msgs/msg/MagneticField"):
         parts.add_magnetometer(clock.samples(select_sensor(path, "magnetometer", found, names), slice(0, 3), 1e6))
     for kind, (stream, column, factor) in _SINGLE.items():
@@ -65,7 +66,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
             parts.add_single(
                 stream, column, clock.samples(select_sensor(path, stream, found, names), slice(0, 1), factor)
             )
-    axes = _body_axes(path, parts)
+    axes = device_axes(path, parts)
     for topic in topics:
         if "Twist" in topic.kind:
             _add_velocity(clock, parts, topic, imus[0].frame if imus else "", axes)
@@ -90,8 +91,7 @@ class _Clock:
 
     @staticmethod
     def _delay(topic: Topic) -> int:
-        delays = topic.log_ns - topic.t_ns
-        return int(np.sort(delays)[len(delays) // 2])  # exact, unlike a float median
+        return clock_offset(topic.t_ns, topic.log_ns)
 
     def t_ns(self, topic: Topic) -> Times:
         """Stamps (n,) of a topic."""
@@ -137,17 +137,6 @@ def _fixes(clock: _Clock, topic: Topic) -> LoggedFixes:
     known = (values[:, 7:8] > 0.0) & (values[:, 3:6] > 0.0)
     sigma = np.sqrt(np.where(known, values[:, 3:6], np.nan))
     return LoggedFixes(clock.t_ns(topic), lat, lon, height, sigma=sigma)
-
-
-def _body_axes(path: Path, parts: LogParts) -> BodyAxes:
-    """Axes that the data show; by default forward is +x (REP 103), where that is not the vertical axis."""
-    if "imu" not in parts.tables:
-        return BodyAxes("+x", "+z")
-    found = find_body_axes(parts.tables["imu"][1], parts.tables["gnss"][1] if "gnss" in parts.tables else None)
-    forward = found.forward if found.forward_found or found.up[1] == "x" else "+x"
-    source = "by the course of the fixes" if found.forward_found else "by default; the fixes do not show it"
-    _log.info("%s: up %s by gravity, forward %s %s", path, found.up, forward, source)
-    return BodyAxes(forward, found.up, found.forward_found, found.up_found)
 
 
 def _add_velocity(clock: _Clock, parts: LogParts, topic: Topic, imu_frame: str, axes: BodyAxes) -> None:

@@ -82,7 +82,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         _report_dropouts(path, log)
     for name in ("vehicle_gps_position", "sensor_gps"):
         if (name, 0) in sets and "gnss" not in parts.tables:
-            parts.add_fixes(path, _fixes(sets[name, 0]))
+            parts.add_fixes(path, _fixes(sets[name, 0]), may_repeat=True)
     for name, field in (("vehicle_magnetometer", "magnetometer_ga[{}]"), ("sensor_mag", "{}")):
         if (name, 0) in sets and "magnetometer" not in parts.tables:
             field_ut = 100.0 * _vector(sets[name, 0], field)  # gauss -> uT

@@ -60,7 +60,7 @@ def session(tmp_path):
 
 def test_rows_stamps_and_axes(session):
     counts = {name: len(stream) for name, stream in session.streams().items()}
-    assert counts == {"imu": 200, "gnss": 1, "magnetometer": 20, "barometer": 20}
+    assert counts == {"imu": 200, "gnss": 5, "magnetometer": 20, "barometer": 20}
     assert session.imu.t_ns[[0, 1]].tolist() == [20_000_000_000, 20_005_000_000]
     assert (session.clock_epoch, session.device.forward, session.device.up) == ("boot", "+x", "-z")
     assert session.device.name == "PX4 TESTED_V5"
@@ -79,15 +79,15 @@ def test_fixes_have_ellipsoidal_heights_sigmas_and_velocities_east_north_up(sess
     assert gnss.sigma[0].tolist() == [2.5, 2.5, 4.0]
     assert gnss.velocity[0].tolist() == [-1.0, 3.0, -0.25]
     assert gnss.sigma_velocity[0].tolist() == [0.5, 0.5, 0.5]
-    assert gnss.fix_type.tolist() == [3]
+    assert gnss.fix_type.tolist() == [3] * 5
 
 
 def test_rows_without_a_fix_and_invalid_velocities_are_no_values(tmp_path):
     rows = [*flight(), ("vehicle_gps_position", 0, (T0 + 900_000, *FIX[:-2], 0, True))]
     rows += [("vehicle_gps_position", 0, (T0 + 950_000, 634170000, *FIX[1:-2], 2, False))]
     gnss = readers.read(write(tmp_path, rows)).gnss
-    assert len(gnss) == 2
-    assert np.isnan(gnss.velocity[1]).all() and np.isnan(gnss.lla[1, 2])  # two dimensions: no height
+    assert len(gnss) == 6 and gnss.fix_type[-1] == 2
+    assert np.isnan(gnss.velocity[-1]).all() and np.isnan(gnss.lla[-1, 2])  # two dimensions: no height
 
 
 def test_the_other_inertial_sensors_are_named_and_can_be_chosen(tmp_path, caplog):
