@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+from decimal import ROUND_HALF_EVEN, Decimal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,7 +46,7 @@ def ns_from_text(text: str, unit_ns: int = NS) -> int:
     try:
         value = Decimal(text.strip()) * unit_ns
         ns = int(value.quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
-    except (InvalidOperation, ValueError) as error:  # ValueError: nan
+    except (ArithmeticError, ValueError) as error:  # ValueError: nan
         raise SessionError("time stamp", f"{text!r} is no number", "a decimal number of seconds") from error
     if abs(ns) >= 2**63:
         raise SessionError("time stamp", f"{text!r} does not fit int64 nanoseconds", "within 292 years of the epoch")

@@ -103,6 +103,8 @@ def clock_resets(rows: Table) -> Indices:
     values = [np.asarray(column) for name, column in rows.items() if name != "t_ns"]
     resets = []
     for row in np.flatnonzero(np.diff(t) < -_RESET_S * NS) + 1:
+        if row < 3:  # too few before it to have a period
+            continue
         order = np.argsort(t[:row], kind="stable")
         before, late = t[:row][order], row + np.flatnonzero(t[row:] < t[:row].max())
         at = np.searchsorted(before, t[late])
@@ -113,7 +115,7 @@ def clock_resets(rows: Table) -> Indices:
         first = at == 0
         apart = first & (before[0] - t[late][first].max(initial=t.min()) > most)
         merged = ~same & np.where(first, apart, step < most)
-        if len(before) > 2 and merged.sum() >= min(_RESET_ROWS, len(t) - row) and 2 * merged.sum() > len(late):
+        if merged.sum() >= min(_RESET_ROWS, len(t) - row) and 2 * merged.sum() > len(late):
             resets.append(row)
     return np.array(resets, dtype=np.intp)
 

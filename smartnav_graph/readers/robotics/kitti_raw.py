@@ -91,6 +91,8 @@ def _oxts(folder: Path) -> tuple[Floats, Times]:
             cells = [float(cell) for cell in file.read_text(encoding="ascii", errors="replace").split()]
             if len(cells) < _LEAST_COLUMNS:
                 raise ValueError(f"{len(cells)} numbers")
+            if not np.isfinite(cells[:_LEAST_COLUMNS]).all() or abs(cells[0]) > 90.0 or abs(cells[1]) > 360.0:
+                raise ValueError("a number is out of range")
         except (OSError, ValueError) as error:
             raise SessionError(file, f"cannot be read ({error})", "30 numbers of OXTS", "copy it again") from error
         rows.append(cells[:_LEAST_COLUMNS])

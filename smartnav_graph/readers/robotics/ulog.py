@@ -72,6 +72,19 @@ class _Imu:
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
     path, names = split_source(source)
     log = _opened(path)
+    try:
+        parts = _streams(path, log, names, repairs)
+    except KeyError as error:  # a field that every version of PX4 has
+        raise SessionError(path, f"a message has no field {error}", "a log of PX4", "copy it again") from error
+    if not parts.tables:
+        seen = ", ".join(sorted({found.name for found in log.data_list})) or "no message"
+        raise SessionError(path, f"holds {seen} of what is read", f"some of {', '.join(MESSAGES)}", "log them")
+    name = " ".join(str(log.msg_info_dict[key]) for key in ("sys_name", "ver_hw") if key in log.msg_info_dict)
+    return log_session(parts, repairs, name=name or "PX4", epoch="boot", forward="+x", up="-z")
+
+
+def _streams(path: Path, log: _Log, names: tuple[str, ...], repairs: tuple[str, ...]) -> LogParts:
+    """What is read of a log, one stream after the other."""
     sets = {(found.name, found.multi_id): found.data for found in log.data_list if len(found.data["timestamp"])}
     imus = [imu for name in MESSAGES[:3] for imu in _inertial(path, sets, name, repairs)]
     parts = LogParts()
@@ -95,11 +108,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if ("sensor_gyro", 0) in sets and np.isfinite(warmth := _column(sets["sensor_gyro", 0], "temperature")).any():
         samples = in_time_order(path, _times(sets["sensor_gyro", 0]), warmth, repairs)
         parts.add_single("temperature", "temperature_c", samples)
-    if not parts.tables:
-        seen = ", ".join(sorted({found.name for found in log.data_list})) or "no message"
-        raise SessionError(path, f"holds {seen} of what is read", f"some of {', '.join(MESSAGES)}", "log them")
-    name = " ".join(str(log.msg_info_dict[key]) for key in ("sys_name", "ver_hw") if key in log.msg_info_dict)
-    return log_session(parts, repairs, name=name or "PX4", epoch="boot", forward="+x", up="-z")
+    return parts
 
 
 def _opened(path: Path) -> _Log:
