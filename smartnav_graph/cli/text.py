@@ -11,8 +11,8 @@ from rich.text import Text
 from smartnav_graph.output.summary_json import (
     Summary,
     imu_gaps,
-    list_of,
     numbers_of,
+    other_warnings,
     table_of,
     text_of,
     verdict_lines,
@@ -69,7 +69,7 @@ def run_text(summary: Summary, out: Path) -> str:
         lines.append(f"IMU data gaps: {len(gaps)}, {sum(gap.length_s for gap in gaps):.2f} s in all")
     lines += [f"rejected: {name} {count:.0f}" for name, count in numbers_of(summary, "rejected").items() if count]
     lines += withheld_lines(summary)
-    lines += [f"warning: {text}" for text in list_of(summary, "warnings")]
+    lines += [f"warning: {text}" for text in other_warnings(summary)]
     return "\n".join([*lines, f"run: {out} (report.html, run.rrd, trajectory.csv, summary.json)"])
 
 

@@ -85,6 +85,12 @@ def verdict_lines(summary: Summary) -> list[str]:
     return lines
 
 
+def other_warnings(summary: Summary) -> list[str]:
+    """The warnings that are no reason of the verdict."""
+    reasons = [f"{one['sensor']}: {one['text']}" for one in rows_of(table_of(summary, "verdict"), "reasons")]
+    return [text for text in map(str, list_of(summary, "warnings")) if not text.startswith(tuple(reasons))]
+
+
 def plain(value: object) -> object:
     """Plain JSON types: no NumPy scalar, and null for what is not finite."""
     if isinstance(value, Mapping):

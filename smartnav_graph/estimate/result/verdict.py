@@ -21,6 +21,7 @@ from smartnav_graph.core.arrays import Floats, runs
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
+from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
 from smartnav_graph.factors.imu import ImuBuilder
@@ -40,10 +41,34 @@ REJECTED_RUN, REJECTED_S, REJECTED_SHARE, MOST_REJECTED = 4, 3.0, 0.1, 0.3
 LATE_S = 1.2
 # Biases beyond so many sigmas of what was known of them.
 FAR = 4.0
+# Noise of a constraint of the motion over that of its class.
+WIDE = 6.0
 # Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
 ALIKE, LEAST_PAIRS = 0.35, 40
 # RMS at withheld fixes against that of interpolating the kept ones, and the least number of them.
 WORSE_THAN_INTERPOLATION, LEAST_WITHHELD = 1.1, 20
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Size and number of sigmas of an error from which on it counts, and what it is in words."""
+
+    size: float
+    sigmas: float
+    text: str
+    remedy: str
+
+
+# Receivers are late, antennas lie beside the device, scale factors of phones are wrong, by less.
+_LATER = "the motion fits with stamps {value:+.1f} s later"
+_SCALED = "of {axis} is {percent:+.1f} % too large by the other sensors"
+LIMITS = {
+    "clock": Limit(LATE_S, 4.0, _LATER, "correct its stamps, or its lever arm"),
+    "clock jump": Limit(1.0, 5.0, _LATER + " from there on", "correct its stamps from there on"),
+    "lever arm": Limit(1.5, 4.5, "the motion fits a lever arm {value:+.1f} m longer along {axis}", "correct body_t"),
+    "accelerometer scale": Limit(0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer"),
+    "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope"),
+}
 
 
 @dataclass(frozen=True)
@@ -128,6 +153,17 @@ def _noise(inputs: VerdictInputs) -> Iterator[Reason]:
         yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
 
 
+def _constraints(inputs: VerdictInputs) -> Iterator[Reason]:
+    """What the device is said not to do, and does."""
+    for builder in inputs.solved.problem.builders:
+        for group in builder.noise_groups:
+            found = inputs.solved.pass_state.scale(group)
+            if found > WIDE:
+                text = f"noise of {group.replace('_', ' ')} is found {found:.0f} times what is usual"
+                remedy = "check axes and clock, or give --vehicle none"
+                yield Reason(LEVELS[1], builder.name, text, remedy, found)
+
+
 def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
     """Fixes without sigmas that agree with each other, but with the inertial data only by a correlated error."""
     for builder in position_builders(inputs.solved.problem.builders):
@@ -145,6 +181,25 @@ def _clocks(inputs: VerdictInputs) -> Iterator[Reason]:
         if abs(offset) > LATE_S:
             text = f"its clock is found {offset:+.2f} s off, more than a receiver is late"
             yield Reason(LEVELS[1], name, text, "correct its stamps", offset)
+
+
+def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Errors that have no state, or are more than its prior allows: the clearest one of each sensor. Fixes that are
+    filtered lag by more than a constant time, which looks like a lever arm along the motion."""
+    worst: dict[str, SensorError] = {}
+    session = inputs.solved.problem.session
+    for error in sensor_errors(inputs.solved) if inputs.together else ():
+        limit = LIMITS[error.kind]
+        along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
+        clear = abs(error.value) > max(limit.size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
+        known = worst.get(error.sensor)
+        if clear and (known is None or abs(error.value / error.sigma) > abs(known.value / known.sigma)):
+            worst[error.sensor] = error
+    for sensor, error in worst.items():
+        limit = LIMITS[error.kind]
+        start = None if error.t_ns is None else float(session.seconds(error.t_ns))
+        text = limit.text.format(value=error.value, axis=error.axis, percent=100.0 * error.value)
+        yield Reason(LEVELS[1], sensor, text, limit.remedy, error.value, start)
 
 
 def _biases(inputs: VerdictInputs) -> Iterator[Reason]:
@@ -210,5 +265,6 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
 
 
 TESTS: tuple[Test, ...] = (
-    *(_misfits, _rejected, _noise, _filtered, _clocks, _biases, _alike, _predictions, _recording, _solver),
+    *(_misfits, _rejected, _noise, _constraints, _filtered, _clocks, _sensor_errors, _biases, _alike, _predictions),
+    *(_recording, _solver),
 )

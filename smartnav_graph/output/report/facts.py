@@ -12,8 +12,8 @@ from smartnav_graph.output.summary_json import (
     Summary,
     as_float,
     imu_gaps,
-    list_of,
     numbers_of,
+    other_warnings,
     table_of,
     text_of,
 )
@@ -109,7 +109,7 @@ def _withheld(summary: Summary) -> list[str]:
 
 def warnings(summary: Summary) -> list[tuple[str, str]]:
     """(what is wrong, what to do about it). A message ``found; expected; remedy`` is split at its first semicolon."""
-    texts = [_with_label(str(w)) for w in list_of(summary, "warnings") if str(w).strip()]
+    texts = [_with_label(text) for text in other_warnings(summary) if text.strip()]
     if any(w.startswith(("Dead reckoning", "Visual-inertial odometry")) for w in texts):  # the same with a consequence
         texts = [w for w in texts if not w.startswith("Session: no absolute sensor")]
     if summary.get("converged") is False and not any("converge" in w or "iteration limit" in w for w in texts):

@@ -8,7 +8,7 @@ import rerun as rr
 from smartnav_graph.core.timebase import Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.output.rerun_log.recorder import Recorder
-from smartnav_graph.output.summary_json import Summary, list_of, table_of, text_of, verdict_lines
+from smartnav_graph.output.summary_json import Summary, other_warnings, table_of, text_of, verdict_lines
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
@@ -91,7 +91,7 @@ def _first_lines(session: Session, events: Events, summary: Summary, notes: list
         ]
     sentence = text_of(table_of(summary, "initialisation"), "sentence")
     lines += [(start, "INFO", f"initialisation: {sentence}")] if sentence else []
-    lines += [(start, "WARN", str(text)) for text in list_of(summary, "warnings")]
+    lines += [(start, "WARN", text) for text in other_warnings(summary)]
     return lines + [(start, "INFO", text) for text in notes]
 
 

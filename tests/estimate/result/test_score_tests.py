@@ -1,0 +1,76 @@
+"""Errors without a state, found from the residuals of a solution: their size, and silence where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sessions import recorded, shifted, with_imu
+
+from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.result import summary
+from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
+from smartnav_graph.estimate.run import smooth
+from smartnav_graph.factors.gnss import GnssConfig
+from smartnav_graph.session.session import Mount
+
+CONFIG = replace(Config(), gnss=GnssConfig(time_offset_sigma=0.0))
+
+
+@pytest.fixture(scope="module")
+def eight():
+    return recorded(seconds=120.0, white_m=0.3)
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """The errors of a session by kind and axis."""
+    kept: list[SensorError] = []
+    original = summary.verdict
+
+    def verdict(inputs):
+        kept.extend(sensor_errors(inputs.solved))
+        return original(inputs)
+
+    def of(session):
+        monkeypatch.setattr(summary, "verdict", verdict)
+        kept.clear()
+        smooth(session, CONFIG)
+        return {(error.kind, error.axis): error for error in kept if error.t_ns is None}
+
+    return of
+
+
+def test_none_is_significant_where_there_is_none(eight, found):
+    errors = found(eight)
+    assert {kind for kind, _ in errors} == {"clock", "lever arm", "accelerometer scale", "gyro scale"}
+    assert all(abs(error.value) < 4.0 * error.sigma for error in errors.values())
+
+
+def assert_near(error: SensorError, value: float) -> None:
+    assert abs(error.value) > 4.0 * error.sigma
+    assert error.value == pytest.approx(value, rel=0.3)  # to first order, and beside biases that it shares
+
+
+def test_a_late_clock(eight, found):
+    assert_near(found(shifted(eight, 0.5))["clock", ""], -0.5)  # s
+
+
+def test_a_wrong_lever_arm(eight, found):
+    wrong = eight.replace(sensors={"gnss": Mount(body_t=(-1.0, 0.0, 0.0))})
+    assert_near(found(wrong)["lever arm", "x"], 1.0)  # m
+
+
+def test_a_wrong_gyro_scale(eight, found):
+    wrong = with_imu(eight, gyro=eight.imu.gyro * [1.0, 1.0, 1.03])
+    assert_near(found(wrong)["gyro scale", "z"], 0.03)
+
+
+def test_readings_that_are_only_noise_have_no_scale(eight, found):
+    """About the horizontal axes the device turns little: its readings are bias and noise, which a scale of 100 % would
+    explain."""
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0.0, 0.01, (len(eight.imu), 2))
+    errors = found(with_imu(eight, gyro=np.column_stack([noise, eight.imu.gyro[:, 2]])))
+    assert ("gyro scale", "x") not in errors and ("gyro scale", "y") not in errors
