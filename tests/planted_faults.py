@@ -374,4 +374,4 @@ def _camera_with_fixes(seed: int) -> Session:
     return replace(find_scenario("room-30s"), pose_fixes=pose_fixes)(seed)
 
 
-SCENES: Mapping[str, Callable[[int], Session]] = {"room-fixes": _camera_with_fixes}
+SCENES: Mapping[str, Callable[[int], Session]] = {"camera-fixes": _camera_with_fixes}

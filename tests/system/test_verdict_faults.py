@@ -21,7 +21,7 @@ FAST = {
     ),
     "trolley-loop": ("scale 5 %", "lever arm 3 m", "gyro bias 0.2 rad/s"),
 }
-LONG = ("kitti", "car-10min", "walk-10min", "trolley-loop", "room-fixes")
+LONG = ("kitti", "car-10min", "walk-10min", "trolley-loop", "camera-fixes")
 
 
 @cache
