@@ -89,8 +89,9 @@ def describe_unknown(source: str | Path) -> UnknownFile:
         return UnknownFile(path, (kind or "a binary file",))
     app = next((name for word, name in _APPS.items() if word.lower() in text[:4096].lower()), None)
     likely = (f"likely of {app}",) if app else ()
-    if text.lstrip()[:1] in "{[<":
-        return UnknownFile(path, (*likely, "JSON" if text.lstrip()[0] in "{[" else "XML"))
+    start = text.lstrip()[:1]
+    if start in ("{", "[", "<"):
+        return UnknownFile(path, (*likely, "XML" if start == "<" else "JSON"))
     return _table(path, text, likely)
 
 

@@ -176,3 +176,13 @@ def test_import_of_several_files(parts, tmp_path, capsys):
     assert "clock: " in capsys.readouterr().out and (tmp_path / "S" / "gnss.parquet").is_file()
     assert main([*command, "--force", "--shift", "fixes.csv"]) == 1
     assert "--shift: 'fixes.csv'; expected FILE=SECONDS" in capsys.readouterr().err
+
+
+def test_a_phone_and_the_receiver_of_the_car(dataset):
+    """SensorLog's own fixes stay, those of the car's receiver become pose fixes, on one Unix clock."""
+    logs = dataset("phone_logs") / "sensorlog_ios"
+    joined = join([str(logs / "drive_phone.csv"), str(logs / "drive_reference_gps.csv")])
+    session = joined.session
+    assert "both have one clock" in joined.ties[0].how
+    assert len(session.pose_fixes) > 1000 and len(session.gnss) > 300
+    assert abs(session.pose_fixes.t_ns[0] - session.gnss.t_ns[0]) < 60 * NS

@@ -344,6 +344,15 @@ def test_sigmas_heights_and_repairs_are_reported():
     assert "1 of 29 rows have no sigma" in only(partly, "info")
 
 
+def test_velocities_without_a_vertical_part_are_reported():
+    fixes = make_fixes()
+    level = replace(fixes, velocity=np.tile([1.0, 0.0, np.nan], (len(fixes), 1)))
+    text = "gnss: 29 velocities have no vertical part, as those of speed and course; not used in the estimate"
+    assert text in [str(finding) for finding in inspect(make_session(gnss=level)).findings if finding.level == "info"]
+    whole = replace(fixes, velocity=np.tile([1.0, 0.0, 0.0], (len(fixes), 1)))
+    assert not any("vertical part" in str(finding) for finding in inspect(make_session(gnss=whole)).findings)
+
+
 def test_pictures_that_are_missing(tmp_path):
     """A warning before matching, an information after it, nothing where all are there or none is named."""
     (tmp_path / "a.png").touch()

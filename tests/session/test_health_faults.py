@@ -33,6 +33,11 @@ def scaled(stream: str, column: str, factor: float):
     return fault
 
 
+def level_velocity(factor: float):
+    """Velocities as of speed and course, without a vertical part."""
+    return lambda session: changed(session, "gnss", velocity=session.gnss.velocity * [factor, factor, np.nan])
+
+
 def turned_velocity(session: Session) -> Session:
     return changed(session, "gnss", velocity=session.gnss.velocity[:, [1, 0, 2]])
 
@@ -159,6 +164,7 @@ FAULTS = [
         "times the speed of the fixes: it looks like km/h",
         "m/s",
     ),
+    (CAR, level_velocity(3.6), "times the speed of the fixes: it looks like km/h", "give m/s"),
     (CAR, scaled("gnss", "velocity", -1.0), "gnss: velocity points against the motion", "flip its sign"),
     (CAR, turned_velocity, "gnss: velocity fits the fixes with east and north exchanged", "exchange ve and vn"),
     (CAR, frozen_receiver, "gnss: repeats one position for 29 s", "receiver output frozen"),

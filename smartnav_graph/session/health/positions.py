@@ -218,12 +218,18 @@ def _moves(facts: Facts, span: Times) -> bool:
 def _velocities(facts: Facts) -> Iterator[Finding]:
     """Velocities that come with the fixes against the motion between them."""
     gnss, chords = facts.session.gnss, facts.chords
-    if gnss is None or gnss.velocity is None or chords is None:
+    if gnss is None or gnss.velocity is None:
         return
-    known = np.isfinite(gnss.velocity).all(axis=1)
+    known = np.isfinite(gnss.velocity[:, :2]).all(axis=1)
+    flat = int((known & np.isnan(gnss.velocity[:, 2])).sum())
+    if flat:  # phones filter speed and course: they lag behind the fixes
+        text = f"{flat} velocities have no vertical part, as those of speed and course"
+        yield Finding("gnss", text, "not used in the estimate", "info")
+    if chords is None:
+        return
     if known.sum() < LEAST_ROWS or chords.clear.sum() < LEAST_ROWS:
         return
-    measured = over_chords(chords, gnss.t_ns[known], gnss.velocity[known])[chords.clear]
+    measured = over_chords(chords, gnss.t_ns[known], gnss.velocity[known, :2])[chords.clear]
     motion = chords.velocity[chords.clear]
     yield from odd_speed("gnss", "velocity", np.linalg.norm(measured[:, :2], axis=1), chords.speed[chords.clear])
     length = np.linalg.norm(measured[:, :2], axis=1) * np.linalg.norm(motion[:, :2], axis=1)
