@@ -17,6 +17,8 @@ from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
+from smartnav_graph.session.detect.heights import HeightLevels, height_steps, least_step, levels
+from smartnav_graph.session.detect.motion import levelled_motion
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
 from smartnav_graph.session.detect.out_of_reach import out_of_reach
 from smartnav_graph.session.detect.scatter import scatter
@@ -40,6 +42,7 @@ class Notes:
     causal : for a replay; span : first and last stamp to smooth; gaps : of the inertial data inside it
     clocks : comparison of the sensors' clocks; findings : warnings of the health; withheld : rows held out, by stream
     dropped : rows that are not used, by stream and reason
+    heights : levels of the heights of streams that have another datum, or more than one
     """
 
     config: Config
@@ -54,6 +57,7 @@ class Notes:
     warnings: list[str] = field(default_factory=list)
     pairs: Pairs | None = None
     rests: Standstills | None = None
+    heights: dict[str, HeightLevels] = field(default_factory=dict)
 
     def drop(self, reason: str, counts: Mapping[str, int]) -> None:
         """Count rows that are not used, by stream."""
@@ -204,6 +208,34 @@ def undo_latencies(session: Session, notes: Notes) -> Session:
     return undo_latency(session, notes.config.pose_fixes)
 
 
+def level_heights(session: Session, notes: Notes) -> Session:
+    """GNSS heights without steps of their own: those of another level are shifted to that of most fixes, and the offset
+    is a state. By rows that are not withheld; in a replay, where steps are found later, only for the last solution."""
+    kept, _ = split(session, notes.config.run.withhold)
+    gnss, motion = kept.gnss, levelled_motion(kept.require_imu())
+    if gnss is None or motion is None or session.device.mounting == "foot":
+        return session
+    known, noise = gnss.has_height, notes.calibration.gnss_noise
+    t_ns, position = gnss.t_ns[known], kept.nav_position(gnss)[known]
+    least = least_step(gnss, noise)
+    steps = height_steps(t_ns, position, motion, least)
+    for step in steps:
+        at = float(session.seconds(step.t_ns))
+        text = f"heights step by {step.size:+.1f} m at {at:.1f} s, and nothing else does"
+        remedy = "bring all heights to one datum; the offset is estimated"
+        found = Finding("gnss", text, remedy, size=step.size, start_ns=step.before_ns, end_ns=step.t_ns)
+        notes.findings, notes.warnings = [*notes.findings, found], [*notes.warnings, str(found)]
+    if steps:
+        notes.heights["gnss"] = levels(steps, t_ns, least)
+    return session if notes.causal else on_one_datum(session, notes.heights)
+
+
+def on_one_datum(session: Session, heights: Mapping[str, HeightLevels]) -> Session:
+    """The session with the heights of these streams on the datum of the solution."""
+    positions = session.positions()
+    return session.replace(**{name: found.shifted(positions[name]) for name, found in heights.items()})
+
+
 def withhold(session: Session, notes: Notes) -> Session:
     """Rows held out to test the solution with."""
     session, notes.withheld = split(session, notes.config.run.withhold)
@@ -312,6 +344,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "calibration": calibrate,
     "sensors": choose_sensors,
     "latency": undo_latencies,
+    "heights": level_heights,
     "holdout": withhold,
     "sigmas": check_sigmas,
     "outside": drop_outside,

@@ -9,7 +9,7 @@ import numpy as np
 
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.preparation import PREPARE, Notes, dropped_text, unused_streams
+from smartnav_graph.estimate.preparation import PREPARE, Notes, dropped_text, on_one_datum, unused_streams
 from smartnav_graph.factors import make_builders
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import delayed
@@ -17,6 +17,7 @@ from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.detect.heights import HeightLevels
 from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.health.clocks import ClockReport
@@ -49,6 +50,7 @@ class Problem:
     pairs: Pairs | None = None
     clocks: ClockReport = ClockReport()
     findings: Sequence[Finding] = ()
+    heights: Mapping[str, HeightLevels] = field(default_factory=dict)
 
     @property
     def vehicle(self) -> str:
@@ -92,6 +94,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     context = FactorContext(
         *(session, notes.calibration, notes.gaps, config.run.vehicle or session.device.vehicle, config),
         *(notes.rests, causal, notes.pairs),
+        heights={} if causal else notes.heights,
         session_states_fixed=config.replay.smoother == "isam2",
         polished=config.replay.polish,
     )
@@ -105,6 +108,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     return Problem(
         *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
         *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks, notes.findings),
+        notes.heights,
     )
 
 
@@ -129,14 +133,18 @@ def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
     """The problem of a replay for a batch solution: every row at its measurement time, keyframes, gaps and builders by
     all that was recorded. Only rows known by `available_ns` where that is given; the problem itself where there is no
     difference."""
+    session = on_one_datum(problem.session, problem.heights)
     context = FactorContext(
-        *(problem.session, problem.calibration, problem.gaps, problem.vehicle, problem.config, problem.rests),
+        *(session, problem.calibration, problem.gaps, problem.vehicle, problem.config, problem.rests),
         pairs=problem.pairs,
+        heights=problem.heights,
     )
     windows, _ = session_windows(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
     merge = round(problem.config.keyframes.merge_s * NS)
     delays = any(delayed.is_delayed(stream, merge).any() for stream in problem.session.absolute().values())
-    if not (problem.gaps or delays) and [w.t1_ns for w in windows] == [w.t1_ns for w in problem.windows]:
+    if not (problem.gaps or delays or problem.heights) and [w.t1_ns for w in windows] == [
+        w.t1_ns for w in problem.windows
+    ]:
         if not any(builder.causal for builder in problem.builders):
             return problem
         made = {builder.name: builder for builder in make_builders(context)}
@@ -144,4 +152,4 @@ def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
         return replace(problem, builders=[builder for builder in kept if builder is not None])
     if available_ns is not None:
         windows = delayed.drop_unknown(windows, problem.session.streams(), available_ns)
-    return replace(problem, imu=context.bridged_imu, windows=windows, builders=make_builders(context))
+    return replace(problem, session=session, imu=context.bridged_imu, windows=windows, builders=make_builders(context))

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Times
+from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.factors import gap_model
 from smartnav_graph.factors.gap_model import Bridge
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.detect.heights import HeightLevels
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Imu
@@ -32,6 +33,7 @@ class FactorContext:
     rests : standstills of the recording; causal : replay, where nothing may be learned from later data
     pairs : image pairs of the session
     session_states_fixed : the smoother of a replay keeps session states at their initial values
+    heights : levels of the heights of streams that have another datum, or more than one
     polished : a batch solution follows the replay
     """
 
@@ -45,6 +47,12 @@ class FactorContext:
     pairs: Pairs | None = None
     session_states_fixed: bool = False
     polished: bool = True
+    heights: Mapping[str, HeightLevels] = field(default_factory=dict)
+
+    def height_offsets(self, name: str, t_ns: Times) -> Floats:
+        """What was taken (n,) m from the heights of a stream's rows."""
+        found = self.heights.get(name)
+        return np.zeros(len(t_ns)) if found is None else found.offset[found.of(t_ns)]
 
     def options(self, kind: type[Section]) -> Section:
         """The section of the configuration that is a `kind`, such as `GnssConfig`."""

@@ -63,7 +63,7 @@ class GnssConfig:
 
 class PositionFix:
     """Data: fix (3) m, lever arm (3) m body axes, sigma (3) m. `extra`: C adds the correlated error of the fix, L to
-    the lever arm."""
+    the lever arm, O the offset of its height."""
 
     width = 9
 
@@ -74,11 +74,13 @@ class PositionFix:
         states = dict(zip(self.extra, extra, strict=True))
         lever = data[:, 3:6] + states.get("L", 0.0)
         weight = 1.0 / data[:, 6:9, None]
-        residual = (p + rotate(R, lever) + states.get("C", 0.0) - data[:, :3]) * weight[:, :, 0]
+        up = np.array([[0.0, 0.0, 1.0]])
+        offset = states.get("C", 0.0) + states.get("O", 0.0) * up
+        residual = (p + rotate(R, lever) + offset - data[:, :3]) * weight[:, :, 0]
         by_state = np.zeros((len(p), 3, 9))
         by_state[:, :, :3] = -R @ skew(lever) * weight
         by_state[:, :, 3:6] = np.eye(3) * weight
-        by = {"C": np.eye(3) * weight, "L": R * weight}
+        by = {"C": np.eye(3) * weight, "L": R * weight, "O": up.T * weight}
         return residual, by_state, [by[letter] for letter in self.extra]
 
 
@@ -111,7 +113,8 @@ class PositionBuilder(Builder):
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
     first. `scatter` of the fixes by themselves, horizontal and vertical,
-    and which `agrees` (n,) with its neighbours. Rows are tested with `least_gate_sigma` m at
+    and which `agrees` (n,) with its neighbours. `height_offset` (n,) m was taken from the heights of rows of another
+    datum: what is left of it is a state of each. Rows are tested with `least_gate_sigma` m at
     least when outliers are looked for.
     """
 
@@ -127,12 +130,15 @@ class PositionBuilder(Builder):
     typical: NDArray[np.bool_] | slice = field(default_factory=lambda: slice(None))
     scatter: tuple[Scatter | None, Scatter | None] = (None, None)
     agrees: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    height_offset: Floats = field(default_factory=lambda: np.zeros(0))
     stage: int = 0
     _ties: Ties = field(default_factory=PerWindow)
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
     def __post_init__(self) -> None:
         self.lever = np.broadcast_to(self.lever, self.position.shape)
+        if not len(self.height_offset):
+            self.height_offset = np.zeros(len(self.position))
 
     def begin(self) -> PositionBuilder:
         return replace(self, _level=PredictionLevel(3))
@@ -167,6 +173,7 @@ class PositionBuilder(Builder):
             typical=typical,
             scatter=parts,
             agrees=agrees,
+            height_offset=context.height_offsets(name, stream.t_ns),
         )
 
     def has_correlated_error(self, pass_state: PassState, *, doubtful: bool = False) -> bool:
@@ -242,6 +249,14 @@ class PositionBuilder(Builder):
             found["L"] = SessionState("L", self.name, name, np.zeros(3), np.full(3, lever))
         return found
 
+    def height_state(self, row: int) -> dict[str, SessionState]:
+        """The state of a row of another datum, by its letter."""
+        offset = self.height_offset[row]
+        if not offset:
+            return {}
+        name = f"{self.name}_height_offset_{offset:+.1f}_m"
+        return {"O": SessionState("O", self.name, name, np.zeros(1), np.array([abs(offset)]), f"{offset:+.1f}")}
+
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """A factor for every row of this stream that became known in the window."""
         if self.name in pass_state.correlated:
@@ -289,12 +304,12 @@ class PositionBuilder(Builder):
         if pass_state.narrowing and loss == "cauchy":
             sigma = np.maximum(sigma, pass_state.robust_floor_m)
         sigma, loss = self._softened(sigma / np.sqrt(max(weight, LEAST_WEIGHT)), loss)
-        chain = self.name in pass_state.correlated
+        chain, states = self.name in pass_state.correlated, {**states, **self.height_state(row)}
         if partial is None and not (states or chain):
             if used:
                 self._add_native(update, row, noise_model(sigma, loss))
             return
-        extra = ("C",) * chain + ("L",) * ("L" in states)
+        extra = ("C",) * chain + tuple(letter for letter in "LO" if letter in states)
         data = np.concatenate([self.position[row], self.lever[row], sigma])
         if partial is not None:
             data = np.concatenate([data, partial.columns()])

@@ -50,6 +50,7 @@ STATES: dict[str, StateKind] = {
         _kind("D", "barometer bias", "chain", [10.0], [1.0]),
         _kind("G", "gap error", "chain", [1.0] * 3 + [0.3] * 3, [0.03] * 3 + [0.01] * 3),
         _kind("T", "time offset", "session", [0.3], [0.01]),
+        _kind("O", "height offset", "session", [10.0], [1.0]),
         _kind("L", "lever arm", "session", [1.0] * 3, [0.05] * 3),
         _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),
         _kind("M", "vehicle mount", "session", [0.3] * 2 + [1.0] * 4 + [0.1] * 2, [0.01] * 2 + [0.1] * 4 + [1e-3] * 2),

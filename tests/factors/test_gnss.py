@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from exact import LEVER, assemble, record
+from numeric import assert_observation, random_rotations
 from scipy.stats import chi2
 
 from smartnav_graph.core.errors import ConfigError
@@ -15,7 +16,7 @@ from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.factors.context import FactorContext
-from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, fix_sigmas, noise_model
+from smartnav_graph.factors.gnss import GnssConfig, PositionBuilder, PositionFix, fix_sigmas, noise_model
 from smartnav_graph.graph.pass_state import PassState, Phase
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import GraphUpdate
@@ -191,3 +192,21 @@ def test_the_builder_keeps_the_sessions_rows():
     recording = record()
     fixes = replace(recording.session.gnss)
     assert assemble(recording.session, recording.truth).builders["gnss"].position.shape == (len(fixes), 3)
+
+
+@pytest.mark.parametrize("extra", [(), ("O",), ("C", "L", "O")])
+def test_derivatives_of_a_fix_by_its_states(extra):
+    rng = np.random.default_rng(0)
+    states = [rng.normal(0.0, 2.0, (4, 1 if letter == "O" else 3)) for letter in extra]
+    data = np.concatenate([rng.normal(0.0, 5.0, (4, 6)), rng.uniform(0.5, 3.0, (4, 3))], axis=1)
+    p, v = rng.normal(0.0, 5.0, (2, 4, 3))
+    assert_observation(PositionFix(extra), random_rotations(rng, 4), p, v, states, data)
+
+
+def test_rows_of_another_datum_have_one_state():
+    fixes = builder(np.zeros((3, 3)), np.ones((3, 3)))
+    fixes.height_offset = np.array([0.0, 47.0, 47.0])
+    update = added(fixes, rows=(0, 1, 2))
+    (state,) = update.session.values()
+    assert state.name == "gnss_height_offset_+47.0_m" and state.sigma.tolist() == [47.0]
+    assert len(update.factors) == 1 and len(update.blocks) == 2

@@ -65,6 +65,8 @@ def fix_residuals(
     a[:, 2] -= builder.gravity
     lever = builder.lever[rows] + estimate.session_value(f"{builder.name}_lever_arm_correction_m", 3)
     residual = p + v * delay + 0.5 * a * delay**2 + rotate(R, lever) - builder.position[rows]
+    states = [builder.height_state(int(row)).get("O") for row in rows]
+    residual[:, 2] += [0.0 if state is None else estimate.session_value(state.name, 1)[0] for state in states]
     if builder.name in pass_state.correlated:
         residual += np.array([estimate.values.atVector(key("C", estimate.indices[k])) for k in keyframe]).reshape(-1, 3)
     P = estimate.covariance[keyframe][:, :6, :6]

@@ -185,7 +185,7 @@ def shape_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Floats
 def still_score(fixes: FixTrack) -> float:
     """`shape_score` of inertial data that see no motion."""
     steps = np.zeros(2)
-    score = shape_score(InertialMotion(0, steps, steps.astype(np.complex128)), fixes, np.zeros(1))
+    score = shape_score(InertialMotion(0, steps, steps.astype(np.complex128), steps), fixes, np.zeros(1))
     return -np.inf if score is None else float(score[0])
 
 

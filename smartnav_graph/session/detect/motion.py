@@ -36,12 +36,13 @@ class InertialMotion:
     """Samples in the middle of steps of `STEP_S` seconds, the first of which begins at `start_ns`.
 
     heading (n,) rad of the body about the vertical, from an unknown zero; displacement (n,) m, complex: east + i north
-    turned by an unknown yaw, up to a polynomial of start, velocity and what tilt and biases leave
+    turned by an unknown yaw, up to a polynomial of start, velocity and what tilt and biases leave; height (n,) m
     """
 
     start_ns: int
     heading: Floats
     displacement: Complexes
+    height: Floats
 
     @property
     def length_s(self) -> float:
@@ -62,7 +63,8 @@ def levelled_motion(imu: Imu) -> InertialMotion | None:
     acceleration: Complexes = level[:, 0] + 1j * level[:, 1]
     rate = np.einsum("ij,ij->i", R.apply(gyro), up)
     velocity = _integral(acceleration - acceleration.mean())
-    return InertialMotion(int(imu.t_ns[0]), _integral(rate), _integral(velocity))
+    climb = _integral(level[:, 2] - level[:, 2].mean())
+    return InertialMotion(int(imu.t_ns[0]), _integral(rate), _integral(velocity), _integral(climb))
 
 
 def _integral(values: NDArray[_Number]) -> NDArray[_Number]:
