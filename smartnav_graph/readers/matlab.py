@@ -8,18 +8,12 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Table
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.readers.mat5 import variable_names
 
 
 def names_in(path: Path) -> frozenset[str]:
     """Names of the variables in a file; none where it is no MATLAB file."""
-    from scipy.io import whosmat
-
-    if path.suffix != ".mat" or not path.is_file():
-        return frozenset()
-    try:
-        return frozenset(str(row[0]) for row in whosmat(str(path), appendmat=False))
-    except (ValueError, OSError, NotImplementedError, TypeError):
-        return frozenset()
+    return frozenset(variable_names(path))
 
 
 def read_mat(path: Path) -> Table:

@@ -47,9 +47,9 @@ class TextRows:
             if self.heading and self.heading in block:
                 again = rb"(?m)^[ \t]*" + re.escape(self.heading) + rb"[ \t]*\r?(?:\n|\Z)"
                 block, times = re.subn(again, b"", block)
-                self._skip("repeated headings", times)
+                self._skip("that repeat the heading left out", times)
             kept = self._without_torn_row(block, before)
-            self._skip("torn last rows", int(len(kept) < len(block)))
+            self._skip("cut at the end of the file left out", int(len(kept) < len(block)))
             before = _last_line(block) or before
             if kept.strip():
                 yield kept

@@ -170,7 +170,7 @@ def test_stamps_in_other_units_and_capital_headings(tmp_path, heading, stamps):
     (tmp_path / "imu.csv").write_text(names + "".join(f"{stamp},0.1,0,0,0,0,9.81\n" for stamp in stamps) + "3")
     session = readers.read(tmp_path)
     assert session.imu.t_ns.tolist() == [1_500_000_000, 2_250_000_000] and session.imu.gyro[0, 0] == 0.1
-    assert session.dropped == {"imu": {"torn last rows": 1}}
+    assert session.dropped == {"imu": {"cut at the end of the file left out": 1}}
 
 
 def test_dates_as_stamps(tmp_path):

@@ -130,7 +130,9 @@ def run(name, mutation, seed, tmp_path):
 
 # A byte among the numbers of a binary file may be any: nothing shows that it is another.
 BINARY = ("cut", "zeros", "empty", "noise", "mark")
-CASES = [(name, mutation) for name in EXPORTS for mutation in (BINARY if name == "gopro" else MUTATIONS)]
+CASES = [
+    (name, mutation) for name in EXPORTS for mutation in (BINARY if name in ("gopro", "matlab-mobile") else MUTATIONS)
+]
 
 
 @pytest.mark.parametrize(("name", "mutation"), CASES)

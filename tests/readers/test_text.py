@@ -175,10 +175,10 @@ def test_encodings(tmp_path, encoding):
 def test_repeated_headings_and_a_torn_last_row_are_counted(tmp_path):
     table = read_text(write(tmp_path, "t,x\n1,2\nt,x\n3,4\n5"))
     assert table.floats("t").tolist() == [1, 3]
-    assert table.skipped == {"repeated headings": 1, "torn last rows": 1}
+    assert table.skipped == {"that repeat the heading left out": 1, "cut at the end of the file left out": 1}
     assert read_text(write(tmp_path, "t,x\n1,2\n3,4")).floats("x").tolist() == [2, 4]
     cut = read_text(write(tmp_path, "t,x\n1,2\n3,4"), whole=True)
-    assert cut.floats("x").tolist() == [2] and cut.skipped == {"torn last rows": 1}
+    assert cut.floats("x").tolist() == [2] and cut.skipped == {"cut at the end of the file left out": 1}
 
 
 def test_missing_values_and_unnamed_columns(tmp_path):

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from smartnav_graph.readers.apps import flysight, gnss_logger, gopro, phyphox, sensor_logger, sensorlog, wide
+from smartnav_graph.readers.apps import (
+    flysight,
+    gnss_logger,
+    gopro,
+    matlab_mobile,
+    phyphox,
+    sensor_logger,
+    sensorlog,
+    wide,
+)
 from smartnav_graph.readers.source import Reader
 
 APP_READERS: tuple[Reader, ...] = (
@@ -13,4 +22,5 @@ APP_READERS: tuple[Reader, ...] = (
     gnss_logger.READER,
     gopro.READER,
     flysight.READER,
+    matlab_mobile.READER,
 )

@@ -111,7 +111,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         table = track.table("GNSS")
         fix_ns = table.times("time")
         parts.add_fixes(track.path, _fixes(table, fix_ns))
-        parts.count("gnss", {"torn last rows": track.torn})
+        parts.count("gnss", {"cut at the end of the file left out": track.torn})
     log = None if sensors is None else _parse(sensors)
     if log is not None:
         line = _clock(log, fix_ns)
@@ -166,7 +166,7 @@ def _add_sensors(log: _Records, line: tuple[int, float, int], parts: LogParts, r
         gyro = table.floats("wx", "wy", "wz") * log.factor("IMU", "wx", ANGULAR_RATE, "deg/s")
         accel = table.floats("ax", "ay", "az") * log.factor("IMU", "ax", ACCELERATION, "g")
         parts.add_imu(read_vector(table, t_ns, gyro, repairs), read_vector(table, t_ns, accel, repairs))
-        parts.count("imu", {"torn last rows": log.torn})
+        parts.count("imu", {"cut at the end of the file left out": log.torn})
         if "temperature" in table.cells:
             parts.add_single(
                 "temperature", "temperature_c", read_vector(table, t_ns, table.floats("temperature"), repairs)

@@ -127,7 +127,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if not parts.tables:
         seen = f"holds no fixes and no inertial data (it has {', '.join(log.others) or 'no records'})"
         raise SessionError(path, seen, "records of Fix, Accel and Gyro", "switch them on in the app")
-    parts.count("gnss" if "gnss" in parts.tables else "imu", {"torn last rows": log.torn})
+    parts.count("gnss" if "gnss" in parts.tables else "imu", {"cut at the end of the file left out": log.torn})
     return log_session(parts, repairs, name=log.device, epoch="unix")
 
 

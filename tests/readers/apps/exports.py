@@ -293,6 +293,80 @@ def gopro_film(path):
     return path
 
 
+def _element(kind, data):
+    return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
+
+
+def _array(name, cls, dims, *parts):
+    flags = _element(6, struct.pack("<II", cls, 0))
+    return _element(14, flags + _element(5, struct.pack("<2i", *dims)) + _element(1, name.encode()) + b"".join(parts))
+
+
+def _doubles(values):
+    return _array("", 6, (len(values), 1), _element(9, struct.pack(f"<{len(values)}d", *values)))
+
+
+def _text(text):
+    return _array("", 4, (1, len(text)), _element(16, text.encode()))
+
+
+def _cells(*parts):
+    return _array("", 1, (1, len(parts)), *parts)
+
+
+def _record(**fields):
+    names = b"".join(name.encode().ljust(16, b"\0") for name in fields)
+    return _array("", 2, (1, 1), _element(5, struct.pack("<i", 16)), _element(1, names), *fields.values())
+
+
+def _reference(index, cls):
+    words = (0xDD000000, 2, 1, 1, index, cls)
+    return _array("", 13, (6, 1), _element(6, struct.pack("<6I", *words)))
+
+
+def _opaque(name, cls, inner):
+    parts = [_element(6, struct.pack("<II", 17, 0)), *(_element(1, text.encode()) for text in (name, "MCOS", cls))]
+    return _element(14, b"".join(parts) + inner)
+
+
+def matlab_mobile(path, *, tables=("Acceleration", "AngularVelocity", "MagneticField", "Position")):
+    """A .mat file of timetables: variables refer to objects in the subsystem, whose first cell lists their properties."""
+    vectors = {"Acceleration": ACCEL, "AngularVelocity": GYRO, "MagneticField": FIELD}
+    variables, cells, objects, blocks = [], [], [(0,) * 6], [b"\0" * 8]
+    names = ["any", "data"]
+    for table in tables:
+        if table in vectors:
+            stamps, titles = times(), "XYZ"
+            columns = [[value] * ROWS for value in vectors[table]]
+        else:
+            stamps, titles = list(range(FIXES)), ("latitude", "longitude", "altitude", "speed", "course", "hacc")
+            columns = [[lat(i) for i in stamps], *([value] * FIXES for value in (11.0, 500.0, 2.0, 0.0, 3.0))]
+        index = len(objects)
+        variables.append(_opaque(table, "timetable", _reference(index, 1)))
+        data, titles = _cells(*map(_doubles, columns)), _cells(*map(_text, titles))
+        cells += [_record(data=data, varNames=titles, rowTimes=_reference(index + 1, 2))]
+        cells += [_doubles([1000.0 * (UNIX + t) for t in stamps])]
+        for name in (1, 2):
+            objects.append((name, 0, 0, len(blocks), 0, 0))
+            blocks.append(struct.pack("<4I", 1, name, 1, len(cells) - 3 + name))
+    text = b"".join(name.encode() + b"\0" for name in names)
+    text += b"\0" * (-len(text) % 8)
+    regions = [b"\0" * 16, b"".join(blocks), b"".join(struct.pack("<6I", *row) for row in objects), b"\0" * 8, b""]
+    offsets, at = [], 40 + len(text)
+    for region in (*regions, b"", b"", b""):
+        offsets.append(at)
+        at += len(region)
+    table = struct.pack("<10I", 4, len(names), *offsets[:8]) + text + b"".join(regions)
+    first = _array("", 9, (len(table), 1), _element(2, table))
+    wrapper = _opaque("", "FileWrapper__", _cells(first, _doubles([]), *cells))
+    system = b"\0\1IM\0\0\0\0" + _array(
+        "", 2, (1, 1), _element(5, struct.pack("<i", 16)), _element(1, b"MCOS".ljust(16, b"\0")), wrapper
+    )
+    head = b"MATLAB 5.0 MAT-file, written by a test".ljust(116) + b"\0" * 8 + b"\0\1IM"
+    path.write_bytes(head + b"".join(variables) + _array("", 9, (1, len(system)), _element(2, system)))
+    return path
+
+
 def zipped(folder, path):
     with zipfile.ZipFile(path, "w") as archive:
         for file in sorted(Path(folder).rglob("*")):
@@ -359,4 +433,5 @@ EXPORTS = {
     "gnss-logger": ("gnss_log.txt", gnss_logger),
     "flysight": ("23-11-14", flysight),
     "gopro": ("GX010001.raw", gopro),
+    "matlab-mobile": ("sensorlog.mat", matlab_mobile),
 }

@@ -15,6 +15,7 @@ from exports import (
     gnss_logger,
     gopro,
     gopro_film,
+    matlab_mobile,
     phyphox,
     physics_toolbox,
     sensor_logger,
@@ -27,6 +28,7 @@ from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 
+DATELESS = ("androsensor", "physics-toolbox", "matlab-mobile")
 START = {"phyphox": UNIX * NS + NS // 2, "androsensor": 33_000_000, "physics-toolbox": 0}
 
 
@@ -52,7 +54,7 @@ def test_each_export_is_recognised_by_one_reader_and_read(tmp_path, name):
     check(session, name, {"gopro": 32, "hyperimu": 0, "phyphox": 3}.get(name, 4))
     start = START.get(name, UNIX * NS)
     assert abs(session.imu.t_ns[0] - start) < (5_000_000 if name == "gopro" else 1000)  # ns
-    assert session.clock_epoch == ("unknown" if name in ("androsensor", "physics-toolbox") else "unix")
+    assert session.clock_epoch == ("unknown" if name in DATELESS else "unix")
     if session.magnetometer is not None:
         np.testing.assert_allclose(session.magnetometer.field_ut[0], FIELD)
     if session.barometer is not None:
@@ -103,7 +105,9 @@ def test_sensor_logger_without_gravity_or_gyro_says_so(tmp_path):
 def test_phyphox_in_other_languages_and_with_decimal_commas(tmp_path, separator, comma, german):
     session = readers.read(phyphox(tmp_path / "x", separator=separator, comma=comma, german=german))
     check(session, fixes=3)  # the last row has no line end
-    assert session.device.name == "Test Phone 1" and session.dropped["gnss"] == {"torn last rows": 1}
+    assert session.device.name == "Test Phone 1" and session.dropped["gnss"] == {
+        "cut at the end of the file left out": 1
+    }
 
 
 def test_phyphox_without_gravity_is_refused(tmp_path):
@@ -183,3 +187,14 @@ def test_a_log_in_g_without_unit_is_known_by_its_size(tmp_path):
     path.write_text("\n".join(["Time (sec),acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z", *rows]) + "\n")
     assert readers.find(path).name == "wide-csv"
     check(readers.read(path), fixes=0)
+
+
+def test_matlab_without_gyro_is_refused_and_foreign_files_are_not_recognised(tmp_path):
+    with pytest.raises(SessionError, match=r"x.mat: holds no gyroscope \(it has Acceleration, Position\)"):
+        readers.read(matlab_mobile(tmp_path / "x.mat", tables=("Acceleration", "Position")))
+    good = (tmp_path / "x.mat").read_bytes()
+    foreign = {"cut": good[:700], "hdf": b"MATLAB 7.3 MAT-file".ljust(600, b"\x89"), "zero": good[:128] + bytes(400)}
+    for name, data in foreign.items():
+        source = tmp_path / f"{name}.mat"
+        source.write_bytes(data)
+        assert sum(reader.matches(str(source)) for reader in readers.READERS.values()) <= 1
