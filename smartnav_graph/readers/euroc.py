@@ -1,4 +1,5 @@
 """EuRoC / ASL folders: ``imu0/data.csv``, ``cam*/data.csv`` with their ``sensor.yaml``, and the ground truth if there.
+TUM-VI folders have the same files, the ground truth in ``mocap0``, and the cameras in ``dso/camchain.yaml`` (Kalibr).
 
 Burri et al. (2016), The EuRoC micro aerial vehicle datasets. The body is the IMU: extrinsics T_BS of the cameras are
 taken relative to the IMU's own. Their interior orientation goes into the calibration, where sensor.yaml has it.
@@ -15,6 +16,8 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import CalibrationError, SessionError
+from smartnav_graph.readers.axes import find_body_axes
+from smartnav_graph.readers.kalibr import kalibr_cameras
 from smartnav_graph.readers.reference import euroc_columns
 from smartnav_graph.readers.source import Reader, build_session, inertial_columns, mount
 from smartnav_graph.readers.text import read_bytes, read_text
@@ -26,7 +29,8 @@ GRAVITY = 9.81
 # The cameras are triggered by the clock of the IMU, and were calibrated with it to hundredths of a degree (Furgale et
 # al. 2013, Kalibr): images of a flight determine their attitude less well.
 calibrated = partial(Camera, boresight_sigma_deg=0.0, time_offset_sigma_s=0.002)
-GROUND_TRUTH = Path("state_groundtruth_estimate0", "data.csv")
+GROUND_TRUTH = (Path("state_groundtruth_estimate0", "data.csv"), Path("mocap0", "data.csv"), Path("gt", "data.csv"))
+CAMERA_CHAIN = (Path("dso", "camchain.yaml"), Path("camchain.yaml"), Path("calibration", "camchain.yaml"))
 
 DEVICE = "EuRoC VI-Sensor ADIS16448"
 
@@ -49,22 +53,39 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     imu = root / "imu0" / "data.csv"
     rows = read_text(imu, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
     samples = inertial_columns(rows.ints("t"), rows.floats("gx", "gy", "gz"), rows.floats("ax", "ay", "az"))
-    tables = {"imu": (imu, samples)}
+    tables: dict[str, tuple[Path, Table]] = {"imu": (imu, samples)}
     cameras = sorted(file.parent.name for file in root.glob("cam*/data.csv"))
     if cameras:
         tables["images"] = (root / cameras[0] / "data.csv", _image_columns(root, cameras))
-    if (root / GROUND_TRUTH).is_file():
-        tables["reference"] = (root / GROUND_TRUTH, euroc_columns(root / GROUND_TRUTH))
+    for truth in (root / name for name in GROUND_TRUTH if (root / name).is_file()):
+        tables.setdefault("reference", (truth, euroc_columns(truth)))
+    if (root / "imu0" / "sensor.yaml").is_file():
+        device, mounts, calibration = Device(DEVICE, "+z", "+x"), _mounts(root, cameras), _calibration(root, cameras)
+    else:
+        chains = [folder / file for folder in (root, root.parent) for file in CAMERA_CHAIN]
+        mounts, calibration = kalibr_cameras(next((file for file in chains if file.is_file()), None), cameras)
+        device = _device(samples, mounts)
     return build_session(
         tables,
         repairs,
-        device=Device(name=DEVICE, forward="+z", up="+x"),
+        device=device,
         clock_epoch="unix",
         gravity_m_s2=GRAVITY,
-        sensors=_mounts(root, cameras),
-        calibration=_calibration(root, cameras),
+        sensors=mounts,
+        calibration=calibration,
         pictures=root,
     )
+
+
+def _device(samples: Table, mounts: Mapping[str, Mount]) -> Device:
+    """Up by gravity; forward the axis nearest to where the first camera looks, where its mount is known."""
+    axes = find_body_axes(samples)
+    forward = axes.forward
+    if mounts:
+        ahead = np.array(next(iter(mounts.values())).body_R)[:, 2] * (np.array(list("xyz")) != axes.up[1])
+        axis = int(np.argmax(np.abs(ahead)))
+        forward = f"{'+' if ahead[axis] > 0 else '-'}{'xyz'[axis]}"
+    return Device(name="ASL folder", forward=forward, up=axes.up)
 
 
 def _image_columns(root: Path, cameras: list[str]) -> Table:
@@ -140,7 +161,7 @@ def _extrinsics(path: Path) -> Floats:
 
 READER = Reader(
     name="euroc",
-    summary="EuRoC / ASL folder: IMU, cameras, ground truth",
+    summary="EuRoC / ASL or TUM-VI folder: IMU, cameras, ground truth",
     recognised_by="a folder (or its mav0) with imu0/data.csv",
     matches=lambda source: _root(source) is not None,
     read_source=_read,

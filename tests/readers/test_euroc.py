@@ -210,3 +210,54 @@ def test_asl_faults(asl, file, text, parts):
         readers.read(asl)
     for part in parts:
         assert part in str(caught.value)
+
+
+CHAIN = """cam0:
+  T_cam_imu:
+  - [-1.0, 0.0, 0.0, 0.1]
+  - [0.0, 0.0, -1.0, -0.05]
+  - [0.0, -1.0, 0.0, 0.02]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [0.0034, 0.0007, -0.0021, 0.0002]
+  distortion_model: equidistant
+  intrinsics: [190.9, 190.9, 254.9, 256.9]
+  resolution: [512, 512]
+  timeshift_cam_imu: -0.0005
+"""
+
+
+def tum_vi(folder):
+    """IMU, one camera and ground truth as TUM-VI has them: no sensor.yaml, mocap0, the camera chain under dso."""
+    t0 = 1520530308199447626
+    for part in ("mav0/imu0", "mav0/cam0/data", "mav0/mocap0", "dso"):
+        (folder / part).mkdir(parents=True)
+    heading = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z,a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z"
+    rows = "\n".join(f"{t0 + i * 5_000_000},0.01,0.02,0.03,0.1,0.2,9.8" for i in range(20))
+    (folder / "mav0/imu0/data.csv").write_text(f"{heading}\n{rows}\n")
+    (folder / "mav0/cam0/data.csv").write_text(f"#timestamp [ns],filename\n{t0},{t0}.png\n")
+    truth = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+    (folder / "mav0/mocap0/data.csv").write_text(f"{truth}\n{t0},1,2,3,1,0,0,0\n{t0 + 8_000_000},1,2,3,1,0,0,0\n")
+    (folder / "dso/camchain.yaml").write_text(CHAIN)
+    return folder
+
+
+def test_tum_vi_folder(tmp_path):
+    session = readers.read(tum_vi(tmp_path))
+    assert (len(session.imu), len(session.images), len(session.reference)) == (20, 1, 2)
+    assert (session.device.up, session.device.forward) == ("+z", "-y")  # gravity; the camera looks along -y
+    camera = session.calibration.cameras["cam0"]
+    assert (camera.model, camera.width, camera.fx, camera.time_offset_s) == ("fisheye", 512, 190.9, -0.0005)
+    cam_T_imu = np.array([[-1.0, 0, 0, 0.1], [0, 0, -1, -0.05], [0, -1, 0, 0.02], [0, 0, 0, 1]])
+    np.testing.assert_allclose(np.linalg.inv(cam_T_imu)[:3, 3], session.mount("cam0").body_t, atol=1e-12)
+
+
+def test_without_a_camera_chain_pictures_have_no_calibration(tmp_path):
+    folder = tum_vi(tmp_path)
+    (folder / "dso/camchain.yaml").write_text("cam0: {T_cam_imu: [1, 2]}")
+    with pytest.raises(SessionError, match=r"camchain.yaml: cam0 is no camera"):
+        readers.read(folder)
+    (folder / "dso/camchain.yaml").unlink()
+    session = readers.read(folder)
+    assert session.calibration is None and len(session.images) == 1
