@@ -20,7 +20,7 @@ def ulog(formats, rows, info=(("sys_name", "PX4"), ("ver_hw", "TESTED_V5"))):
     formats : message -> fields, each (type, name); ``float[3] x`` counts as one field of three numbers
     rows : (message, instance, values) in the order of the log
     """
-    out = MAGIC + b"\x01" + struct.pack("<Q", 20_000_000)
+    out = bytearray(MAGIC + b"\x01" + struct.pack("<Q", 20_000_000))
     out += _message("B", bytes(40))
     for key, text in info:
         name = f"char[{len(text)}] {key}".encode()
@@ -38,4 +38,4 @@ def ulog(formats, rows, info=(("sys_name", "PX4"), ("ver_hw", "TESTED_V5"))):
             base, _, count = kind.rstrip("]").partition("[")
             codes += (count or "1") + _SIZES[base]
         out += _message("D", struct.pack("<H", known[message, instance]) + struct.pack(f"<{codes}", *values))
-    return out
+    return bytes(out)
