@@ -109,7 +109,8 @@ def _column(table: TextTable, name: str, kind: str | None) -> Column:
 
 
 def _stamps(table: TextTable) -> Times:
-    if len(table) and is_date(table.texts("t_ns")[0]):
+    cells = table.cells["t_ns"]
+    if len(cells) and is_date(cells[0].as_py()):
         return table.times("t_ns")
     try:
         return table.ints("t_ns")
