@@ -19,13 +19,15 @@ from smartnav_graph.readers.positions.listed import SurveyedPoints, is_control, 
 from smartnav_graph.readers.positions.places import fitting_systems
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.detect.standstills import StandstillConfig, find_standstills
+from smartnav_graph.session.health.facts import fix_sigma
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Located, Stream
 from smartnav_graph.session.streams import GnssFix, PoseFix
 
 FAR_M = 50_000.0  # between the places of one recording
 _LEAST_STOP_S, _MOST_STOP_S = 5.0, 30.0  # of a device that is put on a surveyed point
-_FIX_SIGMA_M = 5.0
+_LEAST_WITH_FIXES_S = 2.0  # where the fixes choose among the stops
+_AWAY_M, _AWAY_SIGMAS = 10.0, 4.0  # of a fix from the point at which it was taken
 _STAMPS = ("t_ns", "arrival_ns", "t_end_ns", "t_1_ns")
 _SAME_ROWS = 0.5  # share of positions that two files have in common when they are of one receiver
 
@@ -183,23 +185,30 @@ def _on_one_frame(base: Session, other: Session, source: str) -> Session:
 
 def _at_stops(session: Session, points: SurveyedPoints) -> SurveyedPoints:
     """Points in the order of a list at the stops of the device: those near the fixes, else as many as there are."""
-    imu, n = session.require_imu(), len(points.ids)
-    calibration = session.calibration or Calibration()
-    gaps = find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel]))
-    config = StandstillConfig(mounting=session.device.mounting)
-    found = find_standstills(
-        imu, session.static, gaps, session.device.vehicle, calibration.imu_noise, session.gravity, config
-    )
-    stops = np.array([s for s in found.spans() if s[1] - s[0] >= _LEAST_STOP_S * NS], dtype=np.int64).reshape(-1, 2)
-    if len(stops) > n and session.gnss is not None and not points.is_local:
+    n, with_fixes = len(points.ids), session.gnss is not None and not points.is_local
+    least_s = _LEAST_WITH_FIXES_S if with_fixes else _LEAST_STOP_S
+    stops = _stops(session, session.device.vehicle, least_s)
+    if len(stops) < n and session.device.vehicle == "none":
+        stops = _stops(session, "foot", least_s)  # a device in a hand is never quite at rest
+    if len(stops) >= n and with_fixes:
         stops = stops[_nearest_in_order(session, points, stops)]
     elif len(stops) > n:
         stops = stops[(stops[:, 1] - stops[:, 0]) <= _MOST_STOP_S * NS]
     if len(stops) != n:
         listed = ", ".join(f"{a:.0f}-{b:.0f} s" for a, b in session.seconds(stops).reshape(-1, 2)[:20])
-        text = f"{n} points in order, but {len(stops)} stops of {_LEAST_STOP_S:g} s or more ({listed or 'none'})"
+        text = f"{n} points in order, but {len(stops)} stops of {least_s:g} s or more ({listed or 'none'})"
         raise SessionError(points.path, text, "one stop a point", "add columns start and end, or leave points out")
     return dataclasses.replace(points, t_ns=stops[:, 0], t_end_ns=stops[:, 1], clock_epoch=session.clock_epoch)
+
+
+def _stops(session: Session, vehicle: str, least_s: float) -> Times:
+    """First and last stamp (k, 2) of the stops of a device that is carried so, of `least_s` and more."""
+    imu, calibration = session.require_imu(), session.calibration or Calibration()
+    gaps = find_gaps(imu.t_ns, np.hstack([imu.gyro, imu.accel]))
+    config = StandstillConfig(mounting=session.device.mounting)
+    found = find_standstills(imu, session.static, gaps, vehicle, calibration.imu_noise, session.gravity, config)
+    long = [stop for stop in found.spans() if stop[1] - stop[0] >= least_s * NS]
+    return np.array(long, dtype=np.int64).reshape(-1, 2)
 
 
 def _nearest_in_order(session: Session, points: SurveyedPoints, stops: Times) -> list[int]:
@@ -208,8 +217,11 @@ def _nearest_in_order(session: Session, points: SurveyedPoints, stops: Times) ->
     assert fixes is not None and session.frame is not None
     where, at = session.nav_position(fixes)[:, :2], session.frame.nav_from_lla(np.nan_to_num(points.rows))[:, :2]
     middle = stops[:, 0] + (stops[:, 1] - stops[:, 0]) // 2
-    near = np.stack([np.interp(middle - fixes.t_ns[0], fixes.t_ns - fixes.t_ns[0], axis) for axis in where.T], axis=1)
-    cost = (((at[:, None] - near[None]) / _FIX_SIGMA_M) ** 2).sum(axis=2)
+    since = fixes.t_ns - fixes.t_ns[0]
+    near = np.stack([np.interp(middle - fixes.t_ns[0], since, axis) for axis in where.T], axis=1)
+    sigma = np.interp(middle - fixes.t_ns[0], since, fix_sigma(fixes))
+    apart = np.linalg.norm(at[:, None] - near[None], axis=2)
+    cost = (apart / sigma) ** 2
     n, m = cost.shape
     best = np.full((n + 1, m + 1), np.inf)
     best[0] = 0.0
@@ -222,7 +234,13 @@ def _nearest_in_order(session: Session, points: SurveyedPoints, stops: Times) ->
             j -= 1
         j -= 1
         found.append(j)
-    return found[::-1]
+    found = found[::-1]
+    for i, j in enumerate(found):
+        if apart[i, j] > _AWAY_M + _AWAY_SIGMAS * sigma[j]:
+            text = f"point {points.ids[i]} lies {apart[i, j]:.0f} m from the fixes at the stop at "
+            text += f"{float(session.seconds(middle[j])):.0f} s, the best in this order"
+            raise SessionError(points.path, text, "a stop at every point", "add columns start and end", row=i)
+    return found
 
 
 def _check_places(session: Session, points: SurveyedPoints) -> None:

@@ -168,6 +168,27 @@ def test_stops_are_found_for_points_in_order(tmp_path):
         join([str(tmp_path / "log"), str(tmp_path / "points.csv")])
 
 
+def test_fixes_choose_among_more_stops_than_points(tmp_path):
+    """Three points at four stops of a walk, with fixes of 2 m; without fixes nothing chooses."""
+    session = sn.simulate("walk-all-2min", 1)
+    session = session.replace(static=None, reference=None, pose_fixes=None)
+    session_folder.save(session.replace(control=None), tmp_path / "log")
+    session_folder.save(session.replace(control=None, gnss=None), tmp_path / "bare")
+    control = session.control.take([0, 2, 3])
+    names = zip(control.point_id, *control.lla.T.tolist(), strict=True)
+    lines = [f"{name},{lat!r},{lon!r},{height!r}" for name, lat, lon, height in names]
+    (tmp_path / "points.csv").write_text("\n".join(["id,lat,lon,h", *lines]))
+    found = join([str(tmp_path / "log"), str(tmp_path / "points.csv")]).session.control
+    assert np.abs(found.t_ns - control.t_ns).max() < 3 * NS
+    others = [line.replace(",52.0", ",52.1").replace(",51.9", ",52.0") for line in lines]  # kilometres away
+    (tmp_path / "points.csv").write_text("\n".join(["id,lat,lon,h", *others]))
+    with pytest.raises(SessionError, match=r"point P\d lies \d+ m from the fixes at the stop at \d+ s"):
+        join([str(tmp_path / "log"), str(tmp_path / "points.csv")])
+    (tmp_path / "points.csv").write_text("\n".join(["id,lat,lon,h", *lines[:2]]))
+    with pytest.raises(SessionError, match=r"2 points in order, but \d stops"):
+        join([str(tmp_path / "bare"), str(tmp_path / "points.csv")])
+
+
 def test_import_of_several_files(parts, tmp_path, capsys):
     log, fixes = parts
     source = fix_list(fixes, tmp_path / "fixes.csv", shift_ns=-1000 * NS)
