@@ -116,7 +116,8 @@ def _matches(source: str) -> bool:
     if "\0" in source:
         return False
     files = logger_files(Path(source))
-    return "imu" in files and bool({"sync", "gps"} & files.keys()) and not (Path(source) / "session.toml").is_file()
+    ours = (Path(source) / "session.toml").is_file() or (Path(source) / "imu.csv").is_file()  # columns of a session
+    return "imu" in files and bool({"sync", "gps"} & files.keys()) and not ours
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:

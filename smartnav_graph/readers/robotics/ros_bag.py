@@ -142,15 +142,15 @@ class Topic:
 
     @property
     def t_ns(self) -> Times:
-        return np.array(self._stamps, dtype=np.int64)
+        return np.frombuffer(self._stamps, dtype=np.int64)
 
     @property
     def log_ns(self) -> Times:
-        return np.array(self._logged, dtype=np.int64)
+        return np.frombuffer(self._logged, dtype=np.int64)
 
     @property
     def values(self) -> Floats:
-        return np.array(self._values, dtype=np.float64).reshape(len(self), -1)
+        return np.frombuffer(self._values, dtype=np.float64).reshape(len(self), -1)
 
     @property
     def rate_hz(self) -> float:
