@@ -20,7 +20,7 @@ from smartnav_graph.readers.source import build_session
 from smartnav_graph.session.session import Device, Session
 
 _log = logging.getLogger(__name__)
-SLOWEST_S = 1.0  # between inertial samples
+SLOWEST_S = 0.3  # between inertial samples: slower, steps and turns are not seen at all
 
 
 @dataclass

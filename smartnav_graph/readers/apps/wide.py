@@ -27,6 +27,7 @@ from smartnav_graph.readers.apps.channels import (
 )
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.source import Reader
+from smartnav_graph.readers.stamps import has_zone, is_date
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.readers.text_lines import heading_of
 from smartnav_graph.readers.units import TIME_NS, quantity_in, unit_in
@@ -117,6 +118,7 @@ def row_stamps(table: TextTable, path: Path) -> tuple[Times, Mask, str]:
     """
     columns = [name for name in table.cells if _TIME.fullmatch(quantity_in(name))]
     columns.sort(key=lambda name: not unit_in(name) and "ms" not in quantity_in(name))
+    columns += [name for name in table.cells if is_date(str(table.cells[name][0].as_py()))]
     column = next((name for name in columns if not table.is_empty(name)), None)
     if column is None:
         remedy = "name the column with --columns"
@@ -126,6 +128,8 @@ def row_stamps(table: TextTable, path: Path) -> tuple[Times, Mask, str]:
     first = str(rows.texts(column)[0])
     if _CLOCK.fullmatch(first):
         return _times_of_day(rows, column), known, "unknown"
+    if is_date(first):
+        return rows.times(column), known, "unix" if has_zone(first) else "unknown"
     unit = _time_unit(column) or _likely_unit(path, column, rows)
     t_ns = rows.times(column, unit)
     return t_ns, known, "unix" if t_ns[0] > _UNIX_S * NS else "unknown"

@@ -198,3 +198,36 @@ def test_matlab_without_gyro_is_refused_and_foreign_files_are_not_recognised(tmp
         source = tmp_path / f"{name}.mat"
         source.write_bytes(data)
         assert sum(reader.matches(str(source)) for reader in readers.READERS.values()) <= 1
+
+
+@pytest.mark.parametrize(
+    ("heading", "stamp", "start", "epoch"),
+    [
+        ("time", lambda t: f"2023-11-14T22:13:{20 + t:06.3f}Z", UNIX * NS, "unix"),
+        ("Timestamp", lambda t: f"2023-11-14 22:13:{20 + t:06.3f}", UNIX * NS, "unknown"),
+        ("time", lambda t: f"13:05:{7 + t:06.3f}".replace(".", ":"), 47107 * NS, "unknown"),
+        ("timestamp", lambda t: str(UNIX * 10**9 + round(t * 1e9)), UNIX * NS, "unix"),
+        ("timestamp_us", lambda t: str(round(t * 1e6)), 0, "unknown"),
+        ("t [ms]", lambda t: str(round(t * 1e3)), 0, "unknown"),
+    ],
+)
+def test_stamps_of_other_apps(tmp_path, heading, stamp, start, epoch):
+    path = tmp_path / "other.csv"
+    rows = [",".join([stamp(0.02 * i), *map(str, (*ACCEL, *GYRO))]) for i in range(200)]
+    names = "Accelerometer X (m/s^2),Accelerometer Y (m/s^2),Accelerometer Z (m/s^2)"
+    path.write_text("\n".join([f"{heading},{names},Gyroscope X,Gyroscope Y,Gyroscope Z", *rows]) + "\n")
+    session = readers.read(path)
+    check(session, fixes=0)
+    assert session.imu.t_ns[0] == start and session.clock_epoch == epoch
+    np.testing.assert_allclose(np.diff(session.imu.t_ns), 20_000_000, atol=1000)  # ns
+
+
+def test_gravity_and_linear_acceleration_where_there_is_no_other(tmp_path):
+    path = androsensor(tmp_path / "x.csv")
+    first, heading, *rows = path.read_text(encoding="utf-8").splitlines()
+    heading = (
+        heading.replace("ACCELEROMETER", "LINEAR ACCELERATION") + ",GRAVITY X (m/s²),GRAVITY Y (m/s²),GRAVITY Z (m/s²)"
+    )
+    cut = [",".join(["0.1", "-0.2", "0.0", *row.split(",")[3:], "0", "0", "9.8"]) for row in rows]
+    path.write_text("\n".join([first, heading, *cut]) + "\n", encoding="utf-8")
+    check(readers.read(path))

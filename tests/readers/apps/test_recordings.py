@@ -12,7 +12,7 @@ from smartnav_graph.core.timebase import NS
 RECORDINGS = [
     ("sensor_logger", "sensor-logger", 12047, 59.4, 205, "+y"),
     ("phyphox", "phyphox", 10574, 100.7, 34, "+z"),
-    ("androsensor/Sensor_record_20180803_212713_AndroSensor.csv", "androsensor", 4800, 2.0, 4, "-y"),
+    ("androsensor/Sensor_record_20180803_212713_AndroSensor.csv", "androsensor", 0, 0, 4, "+z"),
     ("hyperimu/imu.csv", "hyperimu", 127, 1.76, 0, "+z"),
     ("sensorlog_ios/drive_phone.csv", "sensorlog", 3418, 10.0, 340, "-x"),
     ("gnsslogger_nmea_gsdc/pixel6.txt", "gnss-logger", 0, 0, 94, "+z"),
@@ -61,8 +61,8 @@ def test_gravity_at_rest(dataset):
     """The quietest second of each lies within 0.3 m/s^2 of g."""
     for file, *_ in RECORDINGS:
         imu = readers.read(dataset("phone_logs") / file).imu
-        # at 2 Hz, and while it is waved about or lasts a second only, nothing is at rest
-        if imu is None or file.startswith(("androsensor", "hyperimu", "gopro_gpmf/hero7", "gopro_gpmf/hero6")):
+        # with gaps of seconds, and while it is waved about or lasts a second only, nothing is at rest
+        if imu is None or file.startswith(("hyperimu", "gopro_gpmf/hero7", "gopro_gpmf/hero6")):
             continue
         if len(imu) < 400:
             continue
@@ -70,6 +70,13 @@ def test_gravity_at_rest(dataset):
         windows = [imu.accel[i : i + n] for i in range(0, len(imu) - n + 1, n)]
         quiet = min(windows, key=lambda rows: rows.std(axis=0).max())
         assert np.linalg.norm(quiet.mean(axis=0)) == pytest.approx(STANDARD_GRAVITY, abs=0.3), file
+
+
+def test_two_samples_a_second_are_no_inertial_data(dataset):
+    session = readers.read(dataset("phone_logs") / RECORDINGS[2][0])
+    assert session.dropped["imu"] == {"inertial, 0.5 s apart, left out: the motion between them is not known": 4800}
+    with pytest.raises(SessionError, match=r"no imu stream \(4800 rows inertial, 0.5 s apart"):
+        session.require_imu()
 
 
 @pytest.mark.parametrize(("file", "reader", "reason"), REFUSED)
