@@ -129,10 +129,10 @@ def run(name, mutation, seed, tmp_path):
 
 
 # A byte among the numbers of a binary file may be any: nothing shows that it is another.
-BINARY = ("cut", "zeros", "empty", "noise", "mark")
-CASES = [
-    (name, mutation) for name in EXPORTS for mutation in (BINARY if name in ("gopro", "matlab-mobile") else MUTATIONS)
-]
+BINARY = dict.fromkeys(("gopro", "matlab-mobile"), ("cut", "zeros", "empty", "noise", "mark"))
+# Names and readings of these have other places in their lines: an exchange would give readings other names.
+PREFIXED = dict.fromkeys(("gnss-logger", "flysight"), tuple(name for name in MUTATIONS if name != "swapped columns"))
+CASES = [(name, mutation) for name in EXPORTS for mutation in {**BINARY, **PREFIXED}.get(name, tuple(MUTATIONS))]
 
 
 @pytest.mark.parametrize(("name", "mutation"), CASES)
