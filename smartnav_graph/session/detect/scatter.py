@@ -20,7 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import welch
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal.windows import hann
 from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
@@ -109,10 +110,27 @@ def sampling_noise(imu: Imu) -> tuple[float, float]:
         return 0.0, 0.0
     rate_hz = NS / float(np.median(np.diff(imu.t_ns)))
     rows = min(SPECTRUM_ROWS, len(imu) // LEAST_PIECES)
+    high = np.fft.rfftfreq(rows) > HIGH_FREQUENCY
 
     def density(values: Floats) -> float:
-        frequency, power = welch(values, rate_hz, nperseg=rows, detrend="linear", average="median", axis=0)
-        floor = np.quantile(power[frequency > HIGH_FREQUENCY * rate_hz], QUANTILE, axis=0)
-        return float(np.sqrt(0.5 * floor.mean()))
+        floor = np.quantile(_spectrum(values, rows)[:, high], QUANTILE, axis=1)
+        return float(np.sqrt(0.5 * floor.mean() / rate_hz))
 
     return density(imu.accel), density(imu.gyro)
+
+
+def _spectrum(values: Floats, rows: int) -> Floats:
+    """One-sided power density (d, rows // 2 + 1) of columns of samples (n, d) at a rate of one: median of pieces of so
+    many rows that overlap by half, without their straight lines, under a Hann window.
+
+    Source: Welch (1967), IEEE Trans. Audio Electroacoust. 15(2), 70; Allen et al. (2012), Phys. Rev. D 85, 122006, B,
+    for the median. All pieces at once: `scipy.signal.welch` takes them one by one.
+    """
+    pieces = sliding_window_view(values, rows, axis=0)[:: rows - rows // 2]
+    line = np.linalg.qr(np.vander(np.arange(rows), 2))[0]
+    window = hann(rows, sym=False)
+    power = np.abs(np.fft.rfft(window * (pieces - (pieces @ line) @ line.T))) ** 2 / (window**2).sum()
+    power[..., 1 : (rows + 1) // 2] *= 2.0
+    even = 2.0 * np.arange(1.0, (len(pieces) - 1) // 2 + 1)
+    bias = 1.0 + float((1.0 / (even + 1.0) - 1.0 / even).sum())
+    return np.asarray(np.median(power, axis=0) / bias)
