@@ -128,10 +128,10 @@ class FixTrack:
 
 def _at(values: Complexes, step: Floats) -> Complexes:
     """Linear interpolation at fractional indices; NaN outside."""
-    index = np.clip(np.floor(step).astype(np.intp), 0, len(values) - 2)
-    part = step - index
-    inside = (step >= 0.0) & (step <= len(values) - 1)
-    return np.where(inside, values[index] * (1.0 - part) + values[index + 1] * part, np.nan)
+    index = np.clip(step.astype(np.intp), 0, len(values) - 2)
+    found = np.take(values, index) + (step - index) * np.take(np.diff(values), index)
+    found[(step < 0.0) | (step > len(values) - 1)] = np.nan
+    return np.asarray(found)
 
 
 def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Floats:
@@ -141,10 +141,12 @@ def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Float
     for begin, end, d in (fixes.chords(1), fixes.chords(max(1, round(_LONG_CHORD_S / fixes.spacing_s)))):
         square, middle = d**2, 0.5 * (begin + end)
         blocks = np.array_split(np.arange(len(d)), np.clip(round((middle[-1] - middle[0]) / _BLOCK_S), 1, len(d)))
+        edges, place = np.unique(np.concatenate([begin, end]), return_inverse=True)
+        first, last = np.split(place, 2)
         for part in np.array_split(np.arange(len(lags)), -(-len(lags) // 500)):
-            lag = lags[part, None]
-            mean = (_at(axis, (end - lag) / STEP_S) - _at(axis, (begin - lag) / STEP_S)) / (end - begin)
-            along = np.conj(np.nan_to_num(mean)) * square
+            reached = _at(axis, (edges - lags[part, None]) / STEP_S)
+            along = np.conj(reached[:, last] - reached[:, first]) * (square / (end - begin))
+            along[np.isnan(along)] = 0.0
             for rows in blocks:
                 t = middle[rows] - middle[rows].mean()
                 count = int(np.ceil(_MOST_RATE * np.ptp(t) / 0.7))

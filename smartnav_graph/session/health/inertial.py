@@ -228,10 +228,14 @@ def spikes(imu: Imu) -> dict[str, Indices]:
         values = getattr(imu, name)
         if len(values) < _SPIKE_ROWS:
             return {}
-        around = np.stack([values[:-4], values[1:-3], values[3:-1], values[4:]])
-        apart = np.abs(values[2:-2] - np.median(around, axis=0)).max(axis=1)
+        a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
+        lower, upper = np.minimum(a, b), np.minimum(c, d)
+        high, low = np.maximum(a, b), np.maximum(c, d)
+        least_of, most_of = np.minimum(lower, upper), np.maximum(high, low)
+        median = 0.5 * (np.maximum(lower, upper) + np.minimum(high, low))
+        apart = np.abs(values[2:-2] - median).max(axis=1)
         limit = max(least, 20.0 * float(np.quantile(apart, 0.99)))
-        rows = 2 + np.flatnonzero((apart > limit) & (apart > 5.0 * np.ptp(around, axis=0).max(axis=1)))
+        rows = 2 + np.flatnonzero((apart > limit) & (apart > 5.0 * (most_of - least_of).max(axis=1)))
         if len(rows):
             found[name] = rows
     return found
