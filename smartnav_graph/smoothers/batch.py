@@ -59,6 +59,8 @@ GOOD_COST = 1.7
 GROW_FROM = 4
 # Position variance (m^2) beyond which nothing holds the trajectory; minutes of dead reckoning reach 1e14.
 LARGEST_VARIANCE = 1e18
+# How much longer a stretch that is not observable is before it is tried again.
+LONGER = 1.1
 # Share of the first stretch that a later one is at least: a few fixes must lie in it.
 SHORTEST_STRETCH = 0.3
 # Turn (rad) that the gyro bias may add to a dead-reckoned guess.
@@ -85,6 +87,7 @@ class Batch:
     values: gtsam.Values = field(default_factory=gtsam.Values)
     _settled: int = 0
     _stretch_s: float = 0.0
+    _retry_s: float = 0.0
     _settle_s: float = 0.0
     _anchor: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     _recent: gtsam.Values = field(default_factory=gtsam.Values)
@@ -118,7 +121,7 @@ class Batch:
         self._recent.insert(new)
         self._share(update, self._recent)
         since = update.t_s - self.updates[self._settled].t_s
-        if since >= self._stretch_s:
+        if since >= max(self._stretch_s, self._retry_s):
             begin = time.perf_counter()
             self._settle(since)
             self._settle_s += time.perf_counter() - begin
@@ -147,7 +150,9 @@ class Batch:
                 self._anchor = _anchor(tree, solve.values, stretch[-1])
                 self._settled = len(self.updates) - 1
         except (RuntimeError, SolverError):
-            return  # not observable yet: a longer stretch is tried at the next update
+            self._retry_s = LONGER * since  # not observable yet
+            return
+        self._retry_s = 0.0
         self.values.update(solve.values)
         self._recent = solve.values
         if growing:
