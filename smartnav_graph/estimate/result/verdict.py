@@ -27,6 +27,7 @@ from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_bui
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA
+from smartnav_graph.session.health.clocks import STATE_S
 
 LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
@@ -37,8 +38,6 @@ ROBUST = (*IMAGES, "magnetometer")
 RARE = 1e-6
 # Consecutive rejected fixes, seconds of them, and share of all, that speak against the solution rather than the fixes.
 REJECTED_RUN, REJECTED_S, REJECTED_SHARE, MOST_REJECTED = 4, 3.0, 0.1, 0.3
-# Receivers are late by less, s.
-LATE_S = 1.2
 # Biases beyond so many sigmas of what was known of them.
 FAR = 4.0
 # Noise of a constraint of the motion over that of its class.
@@ -63,7 +62,7 @@ class Limit:
 _LATER = "the motion fits with stamps {value:+.1f} s later"
 _SCALED = "of {axis} is {percent:+.1f} % too large by the other sensors"
 LIMITS = {
-    "clock": Limit(LATE_S, 4.0, _LATER, "correct its stamps, or its lever arm"),
+    "clock": Limit(STATE_S, 4.0, _LATER, "correct its stamps, or its lever arm"),
     "clock jump": Limit(1.0, 5.0, _LATER + " from there on", "correct its stamps from there on"),
     "lever arm": Limit(1.5, 4.5, "the motion fits a lever arm {value:+.1f} m longer along {axis}", "correct body_t"),
     "accelerometer scale": Limit(0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer"),
@@ -178,7 +177,7 @@ def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
 def _clocks(inputs: VerdictInputs) -> Iterator[Reason]:
     for name in inputs.solved.fixes:
         offset = inputs.solved.estimate.offset_s(name)
-        if abs(offset) > LATE_S:
+        if abs(offset) > STATE_S:
             text = f"its clock is found {offset:+.2f} s off, more than a receiver is late"
             yield Reason(LEVELS[1], name, text, "correct its stamps", offset)
 

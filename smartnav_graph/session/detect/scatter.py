@@ -120,8 +120,8 @@ def sampling_noise(imu: Imu) -> tuple[float, float]:
 
 
 def _spectrum(values: Floats, rows: int) -> Floats:
-    """One-sided power density (d, rows // 2 + 1) of columns of samples (n, d) at a rate of one: median of pieces of so
-    many rows that overlap by half, without their straight lines, under a Hann window.
+    """One-sided power density (d, rows // 2 + 1) of columns of samples (n, d) at a rate of one: median over pieces of
+    that many rows, each half of which overlaps the next; linear trends removed, Hann weights.
 
     Source: Welch (1967), IEEE Trans. Audio Electroacoust. 15(2), 70; Allen et al. (2012), Phys. Rev. D 85, 122006, B,
     for the median. All pieces at once: `scipy.signal.welch` takes them one by one.
