@@ -65,8 +65,10 @@ LIMITS = {
     "clock": Limit(STATE_S, 4.0, _LATER, "correct its stamps, or its lever arm"),
     "clock jump": Limit(1.0, 5.0, _LATER + " from there on", "correct its stamps from there on"),
     "lever arm": Limit(1.5, 4.5, "the motion fits a lever arm {value:+.1f} m longer along {axis}", "correct body_t"),
-    "accelerometer scale": Limit(0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer"),
-    "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope"),
+    "accelerometer scale": Limit(
+        0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer, or check its axes and unit"
+    ),
+    "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
 }
 
 
@@ -263,7 +265,8 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
         yield Reason(LEVELS[1], "solve", text, "raise solver.max_iterations")
 
 
+# What names a cause comes before what it makes of the solution.
 TESTS: tuple[Test, ...] = (
-    *(_misfits, _rejected, _noise, _constraints, _filtered, _clocks, _sensor_errors, _biases, _alike, _predictions),
-    *(_recording, _solver),
+    *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _biases, _alike),
+    *(_predictions, _solver),
 )
