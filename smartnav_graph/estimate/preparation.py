@@ -17,7 +17,7 @@ from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors
-from smartnav_graph.session.detect.heights import HeightLevels, height_steps, least_step, levels
+from smartnav_graph.session.detect.heights import HeightLevels, control_offset, height_steps, least_step, levels
 from smartnav_graph.session.detect.motion import levelled_motion
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
 from smartnav_graph.session.detect.out_of_reach import out_of_reach
@@ -67,6 +67,8 @@ class Notes:
 
 # Scatter of positions, in units of their sigmas, beyond which these are not believed; smaller scatter may be a motion.
 CLAIM, LEAST_SCATTER_M, LEAST_SCATTERED = 2.0, 0.5, 20
+# Heights lie off surveyed points by another datum where they do by so many times what that varies.
+OTHER_DATUM = 4.0
 
 PreparationStep = Callable[[Session, Notes], Session]
 
@@ -209,8 +211,9 @@ def undo_latencies(session: Session, notes: Notes) -> Session:
 
 
 def level_heights(session: Session, notes: Notes) -> Session:
-    """GNSS heights without steps of their own: those of another level are shifted to that of most fixes, and the offset
-    is a state. By rows that are not withheld; in a replay, where steps are found later, only for the last solution."""
+    """GNSS heights on one datum: those of another level than most, or of another datum than surveyed points, are
+    shifted, and the offset is a state. By rows that are not withheld; in a replay, where steps are found later, only
+    for the last solution."""
     kept, _ = split(session, notes.config.run.withhold)
     gnss, motion = kept.gnss, levelled_motion(kept.require_imu())
     if gnss is None or motion is None or session.device.mounting == "foot":
@@ -223,10 +226,17 @@ def level_heights(session: Session, notes: Notes) -> Session:
         at = float(session.seconds(step.t_ns))
         text = f"heights step by {step.size:+.1f} m at {at:.1f} s, and nothing else does"
         remedy = "bring all heights to one datum; the offset is estimated"
-        found = Finding("gnss", text, remedy, size=step.size, start_ns=step.before_ns, end_ns=step.t_ns)
-        notes.findings, notes.warnings = [*notes.findings, found], [*notes.warnings, str(found)]
-    if steps:
-        notes.heights["gnss"] = levels(steps, t_ns, least)
+        finding = Finding("gnss", text, remedy, size=step.size, start_ns=step.before_ns, end_ns=step.t_ns)
+        notes.findings, notes.warnings = [*notes.findings, finding], [*notes.warnings, str(finding)]
+    found = levels(steps, t_ns, least)
+    middle, spread = control_offset(kept.replace(gnss=found.shifted(gnss))) or (0.0, 0.0)
+    if abs(middle) > max(least, OTHER_DATUM * spread):
+        notes.warnings.append(
+            f"gnss: heights lie {middle:+.1f} m off those of the surveyed points: the offset is a state"
+        )
+        found = replace(found, offset=found.offset + middle)
+    if found.offset.any():
+        notes.heights["gnss"] = found
     return session if notes.causal else on_one_datum(session, notes.heights)
 
 

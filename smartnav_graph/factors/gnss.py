@@ -189,6 +189,11 @@ class PositionBuilder(Builder):
         return known or typical >= CARRIER_PHASE_SIGMA or (doubtful and not stated)
 
     @property
+    def measures_height(self) -> Mask:
+        """Mask (n,) of the rows whose height counts."""
+        return np.asarray(self.sigma[:, 2] < UNKNOWN_HEIGHT_SIGMA)
+
+    @property
     def noise_names(self) -> tuple[str, str]:
         """Groups of noise: horizontal and vertical."""
         return self.name, f"{self.name}_vertical"

@@ -73,6 +73,7 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: Account | None) -
         if name in IMAGES:
             rows = solution.residuals.of(name) & solution.residuals.used
             count, square = int(rows.sum()), float((solution.residuals.whitened[rows] ** 2).sum())
+        count -= _unknown_heights(solved, name)
         if name == SMART and tracks is not None:
             count -= POINT_DOF * tracks.used
         before = parts.get(builder_of(name), SensorFit())
@@ -82,6 +83,15 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: Account | None) -
             square=before.square + square,
         )
     return Chi2(solved.estimate.cost, parts)
+
+
+def _unknown_heights(solved: SolvedProblem, name: str) -> int:
+    """Rows in use of a stream of positions that have no height: a residual that is zero, and measures nothing."""
+    found, builders = solved.fixes.get(name), position_builders(solved.problem.builders)
+    if found is None:
+        return 0
+    rows = found.rows[solved.pass_state.used(name, found.rows)]
+    return sum(int((~b.measures_height[rows]).sum()) for b in builders if b.name == name)
 
 
 def _expected(solved: SolvedProblem, name: str) -> float:

@@ -182,8 +182,9 @@ def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
             value = correlated_sigma(builder.noise).tolist()
             found[f"{builder.name}_correlated_sigma_m"] = _state(value, held=True)
         if builder.name in pass_state.noise_scales:
-            sigma = builder.scaled_sigma(pass_state)[~builder.own_sigma]
-            found[f"{builder.name}_sigma_m"] = _state([round(float(s), 4) for s in sigma[0]])
+            row = np.lexsort([~builder.measures_height, builder.own_sigma])[0]  # one with heights, where there is one
+            sigma = builder.scaled_sigma(pass_state)[row]
+            found[f"{builder.name}_sigma_m"] = _state([round(float(s), 4) for s in sigma])
     return found
 
 

@@ -243,10 +243,11 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassSta
     outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
         builder.name, frozenset()
     )
-    used = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
+    inside = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
     normalised = (found.residual / found.sigma) ** 2
     scales = dict(pass_state.noise_scales)
     for name, axes, known in zip(builder.noise_names, (slice(0, 2), slice(2, 3)), builder.scatter, strict=True):
+        used = inside & (builder.measures_height[found.rows] | (axes.start == 0))
         redundancy = float(found.redundancy[used, axes].sum())
         if redundancy < LEAST_REDUNDANCY:
             continue

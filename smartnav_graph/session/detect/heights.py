@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Indices, Times
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
 from smartnav_graph.session.detect.motion import STEP_S, InertialMotion
 from smartnav_graph.session.detect.scatter import agrees_with_neighbours
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import GnssFix
 
@@ -35,6 +36,7 @@ LEAST_FIXES, MOST_FIXES, LONGEST_S = 5, 20, 20.0
 NOTABLE, MOST_CANDIDATES, MOST_STEPS = 2.0, 100, 10
 MAD = 1.4826  # sigma over a median absolute deviation
 LEAST_SIGMA = 0.02  # m
+FEW_M = 5.0  # that the height over one or two points may vary by
 ITERATIONS = 20
 
 
@@ -56,11 +58,6 @@ class HeightLevels:
     t_ns: Times
     level: Indices
     offset: Floats
-
-    @classmethod
-    def one(cls, offset: float) -> HeightLevels:
-        """One level throughout."""
-        return cls(np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.intp), np.array([offset]))
 
     def of(self, t_ns: Times) -> Indices:
         """Level (n,) of the rows at t_ns (n,)."""
@@ -125,6 +122,21 @@ def least_step(fixes: GnssFix, noise: GnssNoise) -> float:
     stated = np.inf if fixes.sigma is None else float(np.nanmedian(fixes.sigma[:, :2]))
     correlated = noise.correlated_vertical_sigma if stated >= CARRIER_PHASE_SIGMA else 0.0
     return max(LEAST_M, CORRELATED * float(np.sqrt(2.0)) * correlated)
+
+
+def control_offset(session: Session) -> tuple[float, float] | None:
+    """Median height (m) of the fixes over surveyed points, and how much it varies; None without both at one time."""
+    gnss, control = session.gnss, session.control
+    if gnss is None or control is None or gnss.has_height.sum() < 2:
+        return None
+    known = gnss.has_height
+    t_ns, height = gnss.t_ns[known], session.nav_position(gnss)[known, 2]
+    rows = control.has_height & (control.t_ns >= t_ns[0]) & (control.t_ns <= t_ns[-1])
+    if not rows.any():
+        return None
+    off = interpolate(control.t_ns[rows], t_ns, height) - session.nav_position(control)[rows, 2]
+    middle = float(np.median(off))
+    return middle, float(np.median(np.abs(off - middle))) if len(off) > 2 else FEW_M
 
 
 def _candidates(left: Floats) -> Indices:

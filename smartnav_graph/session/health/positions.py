@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.timebase import NS, interpolate
+from smartnav_graph.session.detect.heights import control_offset
 from smartnav_graph.session.detect.out_of_reach import out_of_reach
 from smartnav_graph.session.detect.scatter import scatter
 from smartnav_graph.session.health.facts import (
@@ -155,15 +156,10 @@ def _heights(facts: Facts) -> Iterator[Finding]:
         elif not _HEIGHTS_M[0] < float(np.median(height)) < _HEIGHTS_M[1]:
             text = f"median height {np.median(height):.6g} m, where land lies between -430 and 8849 m"
             yield Finding(name, text, "give metres above the ellipsoid")
-    gnss, control = facts.session.gnss, facts.session.control
-    if gnss is None or control is None or len(gnss) < 2:
+    found = control_offset(facts.session)
+    if found is None:
         return
-    t_ns = control.t_ns[(control.t_ns >= gnss.t_ns[0]) & (control.t_ns <= gnss.t_ns[-1])]
-    if not len(t_ns):
-        return
-    points = interpolate(t_ns, control.t_ns, facts.session.nav_position(control)[:, 2])
-    off = interpolate(t_ns, gnss.t_ns, facts.session.nav_position(gnss)[:, 2]) - points
-    middle, spread = float(np.median(off)), float(np.median(np.abs(off - np.median(off)))) if len(off) > 2 else 5.0
+    middle, spread = found
     frames = {facts.session.mount(name).frame for name in ("gnss", "control")}
     if _GEOID_M[0] < abs(middle) < _GEOID_M[1] and abs(middle) > 4.0 * spread and len(frames) == 1:
         text = f"heights lie {middle:+.1f} m off those of the control points, as the geoid does"

@@ -1,12 +1,15 @@
 """Steps of the heights alone are found with time and size; climbs, outliers and jumps of all axes are none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from smartnav_graph.session.calibration.model import GnssNoise
-from smartnav_graph.session.detect.heights import HeightLevels, height_steps, least_step, levels
+from smartnav_graph.session.detect.heights import control_offset, height_steps, least_step, levels
 from smartnav_graph.session.detect.motion import STEP_S, InertialMotion
-from smartnav_graph.session.streams import GnssFix
+from smartnav_graph.session.session import Session
+from smartnav_graph.session.streams import ControlPoint, GnssFix
 
 NS = 10**9
 N = 300
@@ -87,6 +90,19 @@ def test_levels_that_come_again_are_one_and_most_rows_stay():
     np.testing.assert_allclose(shifted.enu[:, 2], hills(T_NS / NS), atol=0.5)
 
 
-def test_one_level_throughout():
+def test_without_steps_there_is_one_level():
+    found = levels([], T_NS)
+    assert found.of(T_NS).tolist() == [0] * N and found.offset.tolist() == [0.0]
     stream = GnssFix(t_ns=T_NS, lla=fixes() * [1e-6, 1e-6, 1.0])
-    np.testing.assert_allclose(HeightLevels.one(47.0).shifted(stream).lla, stream.lla - [0, 0, 47.0])
+    np.testing.assert_allclose(replace(found, offset=found.offset + 47.0).shifted(stream).lla, stream.lla - [0, 0, 47])
+
+
+@pytest.mark.parametrize(("count", "varies"), [(5, 0.0), (1, 5.0)])
+def test_heights_over_surveyed_points(count, varies):
+    at = np.linspace(20, N - 20, count).astype(int)
+    points = ControlPoint(
+        t_ns=T_NS[at], enu=fixes(0.0)[at] - [0.0, 0.0, 47.0], point_id=np.full(count, "a", dtype=object)
+    )
+    middle, spread = control_offset(Session(gnss=GnssFix(t_ns=T_NS, enu=fixes()), control=points))
+    assert middle == pytest.approx(47.0, abs=0.3) and spread == pytest.approx(varies, abs=0.2)
+    assert control_offset(Session(gnss=GnssFix(t_ns=T_NS, enu=fixes()))) is None
