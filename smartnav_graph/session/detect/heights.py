@@ -36,6 +36,7 @@ LEAST_FIXES, MOST_FIXES, LONGEST_S = 5, 20, 20.0
 NOTABLE, MOST_CANDIDATES, MOST_STEPS = 2.0, 100, 10
 MAD = 1.4826  # sigma over a median absolute deviation
 LEAST_SIGMA = 0.02  # m
+SHARE = 0.2  # of a step that its two fixes may differ from it by, beside their noise
 FEW_M = 5.0  # that the height over one or two points may vary by
 ITERATIONS = 20
 
@@ -82,10 +83,14 @@ def height_steps(t_ns: Times, position: Floats, motion: InertialMotion, least: f
     left, found = position[:, 2] - inertial, dict[int, tuple[float, float]]()
     while len(found) < MOST_STEPS:
         best, size, sigma, most = 0, 0.0, 0.0, 0.0
-        for row in _candidates(left):
+        jump = _jumps(left)
+        noise = MAD * float(np.median(np.abs(jump)))
+        for row in _candidates(jump, noise):
             if any(abs(row - other) < LEAST_FIXES for other in found) or not level[max(row - 2, 2) : row + 2].any():
                 continue
             s, spread, gain = _step(t, left, row)
+            if abs(jump[row - 1] - s) > SIGNIFICANT * noise + SHARE * abs(s):
+                continue  # the inertial height bends there: between two fixes there is no such step
             if abs(s) > max(SIGNIFICANT * spread, least) and gain > most:
                 best, size, sigma, most = int(row), s, spread, gain
         if not best:
@@ -139,15 +144,19 @@ def control_offset(session: Session) -> tuple[float, float] | None:
     return middle, float(np.median(np.abs(off - middle))) if len(off) > 2 else FEW_M
 
 
-def _candidates(left: Floats) -> Indices:
-    """Rows that begin a notable step."""
+def _jumps(left: Floats) -> Floats:
+    """Differences (n - 1,) m of neighbouring heights less the median of those around."""
     step = np.diff(left)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(step, 4, mode="reflect"), 9)
-    jump = np.abs(step - np.median(around, axis=1))
-    limit = max(NOTABLE * MAD * float(np.median(jump)), 0.5 * LEAST_M)
-    rows = np.flatnonzero(jump > limit) + 1
-    rows = rows[(rows >= LEAST_FIXES) & (rows <= len(left) - LEAST_FIXES)]
-    return np.asarray(rows[np.argsort(-jump[rows - 1])][:MOST_CANDIDATES])
+    return np.asarray(step - np.median(around, axis=1))
+
+
+def _candidates(jump: Floats, noise: float) -> Indices:
+    """Rows that begin a notable step."""
+    size = np.abs(jump)
+    rows = np.flatnonzero(size > max(NOTABLE * noise, 0.5 * LEAST_M)) + 1
+    rows = rows[(rows >= LEAST_FIXES) & (rows <= len(jump) + 1 - LEAST_FIXES)]
+    return np.asarray(rows[np.argsort(-size[rows - 1])][:MOST_CANDIDATES])
 
 
 def _step(t: Floats, left: Floats, row: int) -> tuple[float, float, float]:

@@ -63,6 +63,13 @@ def test_a_lift_is_no_step():
     assert steps(fixes(height=lift), motion(lift)) == []
 
 
+def test_a_bent_inertial_height_is_no_step_of_the_fixes():
+    def bent(t):
+        return hills(t) + 40.0 * np.tanh((t - 150.0) / 2.0)
+
+    assert steps(fixes(0.3), motion(bent)) == []
+
+
 def test_outliers_and_jumps_of_the_whole_position_are_no_steps():
     position = fixes()
     position[[40, 41, 90, 200], 2] += [60.0, 55.0, -80.0, 30.0]
