@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.stats import chi2 as chi_square
 
-from smartnav_graph.core.arrays import Floats, runs
+from smartnav_graph.core.arrays import Floats, Times, runs
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
@@ -238,11 +239,20 @@ def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
             continue
         missing = session.nav_position(inputs.solved.problem.withheld[name])
         at = np.searchsorted(inputs.solved.problem.withheld[name].t_ns, held.t_ns)
-        line = interpolate(held.t_ns, stream.t_ns, session.nav_position(stream)) - missing[at]
-        ours, theirs = _rms(held.error), _rms(line)
+        curves = interpolated(held.t_ns, stream.t_ns, session.nav_position(stream))
+        ours, theirs = _rms(held.error), min(_rms(curve - missing[at]) for curve in curves)
         if ours > WORSE_THAN_INTERPOLATION * theirs:
-            text = f"withheld fixes are predicted to {ours:.2f} m, to {theirs:.2f} m by a line between the kept ones"
+            text = f"withheld fixes are predicted to {ours:.2f} m, to {theirs:.2f} m by interpolation of the kept ones"
             yield Reason(LEVELS[1], name, text, "check clock, axes and calibration of the inertial data", ours)
+
+
+def interpolated(t_ns: Times, known_ns: Times, position: Floats) -> tuple[Floats, Floats]:
+    """Positions (n, 3) at t_ns (n,) by the line and by the cubic spline through those (m, 3) at known_ns (m,); at both
+    ends, beyond them, constant."""
+    first = np.flatnonzero(np.concatenate([[True], np.diff(known_ns) > 0]))
+    seconds = (known_ns[first] - known_ns[0]) / NS
+    at = (np.clip(t_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS
+    return interpolate(t_ns, known_ns, position), CubicSpline(seconds, position[first])(at)
 
 
 def _rms(error: Floats) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
+from smartnav_graph.estimate.result.verdict import interpolated
 from smartnav_graph.simulation.degrade import Degrade, degrade
 
 NS = 10**9
@@ -71,3 +72,13 @@ def test_faults_are_not_good(drive, fault):
     change, level, word = FAULTS[fault]
     found, text = verdict(change(drive))
     assert found != "good" and (level is None or found == level) and word in text, text
+
+
+def test_withheld_fixes_are_compared_with_the_line_and_the_cubic_between_the_kept_ones():
+    t_ns = np.arange(0, 50, 5) * NS
+    middle = t_ns[:-1] + 2 * NS
+    kept, true = (np.stack([s**3, s**2, s], axis=-1) for s in (t_ns / NS, middle / NS))
+    line, cubic = interpolated(middle, t_ns, kept)
+    assert cubic == pytest.approx(true, abs=1e-6)  # m: a cubic spline without end conditions is exact on a cubic
+    assert line[:, 2] == pytest.approx(true[:, 2]) and (line[:, 1] > true[:, 1] + 5.9).all()  # s (5 - s) = 6 m above
+    assert all(curve[0] == pytest.approx(kept[0]) for curve in interpolated(t_ns[:1] - NS, t_ns, kept))
