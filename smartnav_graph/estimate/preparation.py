@@ -274,19 +274,22 @@ def drop_outside(session: Session, notes: Notes) -> Session:
 
 
 def trim_span(session: Session, notes: Notes) -> Session:
-    """The span cut to `lead_s` before the first and after the last aiding: dead reckoning beyond is of little use."""
+    """The span cut to `lead_s` before the first and after the last aiding: dead reckoning beyond is of little use. To
+    what both cover where an offset of their clocks was applied: what lies beyond is of another part of the motion."""
     aiding, lead_s = session.absolute().values(), notes.config.keyframes.lead_s
     if not aiding:
         return session
+    shifted = [offset.sensor for offset in notes.clocks.offsets if offset.applied]
+    lead_s = 0.0 if shifted else lead_s
     first = min(int(stream.t_ns[0]) for stream in aiding) - round(lead_s * NS)
     last = max(int(stream.t_ns[-1]) for stream in aiding) + round(lead_s * NS)
     span = max(notes.span[0], first), min(notes.span[1], last)
     if span != notes.span:
         begin, end = ((t_ns - session.t0_ns) / NS for t_ns in span)
-        notes.warnings.append(
-            f"keyframes: smoothed from {begin:.1f} to {end:.1f} s only, {lead_s:g} s around the first and last "
-            "absolute measurement; raise keyframes.lead_s to reckon further"
-        )
+        why = f"{lead_s:g} s around the first and last absolute measurement; raise keyframes.lead_s to reckon further"
+        if shifted:
+            why = f"where {', '.join(shifted)} is on the corrected clock; correct its stamps to reckon further"
+        notes.warnings.append(f"keyframes: smoothed from {begin:.1f} to {end:.1f} s only, {why}")
     notes.span, notes.gaps = span, _inside(notes.gaps, span)
     return session
 
