@@ -28,6 +28,7 @@ from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import PerWindow, Window
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
+from smartnav_graph.session.detect.interpolated import interpolation_error
 from smartnav_graph.session.detect.scatter import Scatter, agrees_with_neighbours, scatter
 from smartnav_graph.session.stream import Positioned
 
@@ -112,8 +113,8 @@ class PositionBuilder(Builder):
 
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
-    first. `scatter` of the fixes by themselves, horizontal and vertical,
-    and which `agrees` (n,) with its neighbours. `height_offset` (n,) m was taken from the heights of rows of another
+    first. `scatter` of the fixes by themselves, horizontal and vertical, which `agrees` (n,) with its neighbours, and
+    how far (m) each is off where it was `interpolated` (n,). `height_offset` (n,) m was taken from the heights of rows of another
     datum: what is left of it is a state of each. Rows are tested with `least_gate_sigma` m at
     least when outliers are looked for.
     """
@@ -131,6 +132,7 @@ class PositionBuilder(Builder):
     scatter: tuple[Scatter | None, Scatter | None] = (None, None)
     agrees: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
     height_offset: Floats = field(default_factory=lambda: np.zeros(0))
+    interpolated: Floats = field(default_factory=lambda: np.zeros(1))
     stage: int = 0
     _ties: Ties = field(default_factory=PerWindow)
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
@@ -139,6 +141,7 @@ class PositionBuilder(Builder):
         self.lever = np.broadcast_to(self.lever, self.position.shape)
         if not len(self.height_offset):
             self.height_offset = np.zeros(len(self.position))
+        self.interpolated = np.broadcast_to(self.interpolated, len(self.position))
 
     def begin(self) -> PositionBuilder:
         return replace(self, _level=PredictionLevel(3))
@@ -174,6 +177,7 @@ class PositionBuilder(Builder):
             scatter=parts,
             agrees=agrees,
             height_offset=context.height_offsets(name, stream.t_ns),
+            interpolated=interpolation_error(stream.t_ns, session.require_imu(), context.gaps),
         )
 
     def has_correlated_error(self, pass_state: PassState, *, doubtful: bool = False) -> bool:
@@ -199,8 +203,9 @@ class PositionBuilder(Builder):
         return self.name, f"{self.name}_vertical"
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
-        """Sigmas (n, 3) m after the noise scales of this sensor."""
-        return np.where(self.own_sigma[:, None], self.sigma, self.sigma * self._scale(pass_state))
+        """Sigmas (n, 3) m after the noise scales of this sensor, with the error of interpolated rows."""
+        sigma = np.where(self.own_sigma[:, None], self.sigma, self.sigma * self._scale(pass_state))
+        return np.hypot(sigma, self.interpolated[:, None])
 
     def _scale(self, pass_state: PassState) -> Floats:
         horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
@@ -300,6 +305,7 @@ class PositionBuilder(Builder):
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
         sigma = self.sigma[row] if self.own_sigma[row] else self.sigma[row] * self._scale(pass_state)
+        sigma = np.hypot(sigma, self.interpolated[row])
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:

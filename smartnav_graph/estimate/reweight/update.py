@@ -45,8 +45,8 @@ from smartnav_graph.session.detect.scatter import Scatter
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.redundancy import factor_fits
 
-# No fix is believed better than this, metres: clocks and lever arms are not.
-LEAST_SIGMA = 0.03
+# No fix is believed better than this, metres horizontally and vertically: clocks and lever arms are not.
+LEAST_SIGMA = (0.02, 0.01)
 LEAST_REDUNDANCY = 10.0
 # What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
 PRIOR_FIXES = 30.0
@@ -243,28 +243,31 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassSta
     outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
         builder.name, frozenset()
     )
-    inside = ~builder.own_sigma[found.rows] & ~np.isin(found.rows, list(outside))
+    inside = ~(builder.own_sigma | (builder.interpolated > 0))[found.rows] & ~np.isin(found.rows, list(outside))
     normalised = (found.residual / found.sigma) ** 2
     scales = dict(pass_state.noise_scales)
-    for name, axes, known in zip(builder.noise_names, (slice(0, 2), slice(2, 3)), builder.scatter, strict=True):
+    parts = zip(builder.noise_names, (slice(0, 2), slice(2, 3)), builder.scatter, LEAST_SIGMA, strict=True)
+    for name, axes, known, least in parts:
         used = inside & (builder.measures_height[found.rows] | (axes.start == 0))
         redundancy = float(found.redundancy[used, axes].sum())
         if redundancy < LEAST_REDUNDANCY:
             continue
         square, default = float(normalised[used, axes].sum()), float(builder.sigma[found.rows[used], axes].min())
         sigma = default * pass_state.scale(name)
-        scales[name] = _fix_sigma(sigma, square / redundancy, redundancy, default, known) / default
+        scales[name] = _fix_sigma(sigma, square / redundancy, redundancy, default, known, least) / default
     return replace(pass_state, noise_scales=scales)
 
 
-def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, known: Scatter | None) -> float:
-    """Next sigma (m) of fixes by the mean square of their residuals, and by their own scatter.
+def _fix_sigma(
+    sigma: float, square: float, redundancy: float, default: float, known: Scatter | None, floor: float
+) -> float:
+    """Next sigma (m) of fixes, at least `floor`, by the mean square of their residuals, and by their own scatter.
 
     A solution that is wrong would make the fixes bad until they agree with it: beyond what the fixes show by themselves
     their sigma rises reluctantly, and it stays within a factor of two of their scatter, where that is noise. Where it
     holds motion, it is an upper bound, and so are three times the default of the class.
     """
-    least, most, likely = LEAST_SIGMA, 3.0 * default, default
+    least, most, likely = floor, 3.0 * default, default
     if known is not None and known.is_noise:
         least, most, likely = known.sigma / 2.0, 2.0 * known.sigma, known.sigma
     elif known is not None:
@@ -273,4 +276,4 @@ def _fix_sigma(sigma: float, square: float, redundancy: float, default: float, k
     wanted = sigma * float(np.clip(step if step > 1.0 else step**RELAXATION, 0.2, 5.0))
     if wanted > likely:
         wanted = float(np.sqrt((redundancy * wanted**2 + PRIOR_FIXES * likely**2) / (redundancy + PRIOR_FIXES)))
-    return float(np.clip(wanted, max(least, LEAST_SIGMA), max(most, LEAST_SIGMA)))
+    return float(np.clip(wanted, max(least, floor), max(most, floor)))
