@@ -114,8 +114,8 @@ class PositionBuilder(Builder):
     position (n, 3) nav m, sigma (n, 3) m, lever (3,) or (n, 3) m body axes; `own_sigma` (n,) marks rows whose sigma
     came with the data and is never scaled, `typical` (n,) those whose median sigma counts: in a replay, those known at
     first. `scatter` of the fixes by themselves, horizontal and vertical, which `agrees` (n,) with its neighbours, and
-    how far (m) each is off where it was `interpolated` (n,). `height_offset` (n,) m was taken from the heights of rows of another
-    datum: what is left of it is a state of each. Rows are tested with `least_gate_sigma` m at
+    how far (m) each is off where it was `interpolated` (n,). `height_offset` (n,) m was taken from the heights of rows
+    of another datum: what is left of it is a state of each. Rows are tested with `least_gate_sigma` m at
     least when outliers are looked for.
     """
 
