@@ -246,13 +246,13 @@ def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
             yield Reason(LEVELS[1], name, text, "check clock, axes and calibration of the inertial data", ours)
 
 
-def interpolated(t_ns: Times, known_ns: Times, position: Floats) -> tuple[Floats, Floats]:
-    """Positions (n, 3) at t_ns (n,) by the line and by the cubic spline through those (m, 3) at known_ns (m,); at both
+def interpolated(t_ns: Times, kept_ns: Times, position: Floats) -> tuple[Floats, Floats]:
+    """Positions (n, 3) at t_ns (n,) by the line and by the cubic spline through those (m, 3) at kept_ns (m,); at both
     ends, beyond them, constant."""
-    first = np.flatnonzero(np.concatenate([[True], np.diff(known_ns) > 0]))
-    seconds = (known_ns[first] - known_ns[0]) / NS
-    at = (np.clip(t_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS
-    return interpolate(t_ns, known_ns, position), CubicSpline(seconds, position[first])(at)
+    first = np.flatnonzero(np.concatenate([[True], np.diff(kept_ns) > 0]))
+    seconds = (kept_ns[first] - kept_ns[0]) / NS
+    at = (np.clip(t_ns, kept_ns[0], kept_ns[-1]) - kept_ns[0]) / NS
+    return interpolate(t_ns, kept_ns, position), CubicSpline(seconds, position[first])(at)
 
 
 def _rms(error: Floats) -> float:
