@@ -202,10 +202,15 @@ class PositionBuilder(Builder):
         """Groups of noise: horizontal and vertical."""
         return self.name, f"{self.name}_vertical"
 
+    @property
+    def stated_name(self) -> str:
+        """Group of noise of the rows with a sigma of their own."""
+        return f"{self.name}_stated"
+
     def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scales of this sensor, with the error of interpolated rows."""
-        sigma = np.where(self.own_sigma[:, None], self.sigma, self.sigma * self._scale(pass_state))
-        return np.hypot(sigma, self.interpolated[:, None])
+        scale = np.where(self.own_sigma[:, None], pass_state.scale(self.stated_name), self._scale(pass_state))
+        return np.hypot(self.sigma * scale, self.interpolated[:, None])
 
     def _scale(self, pass_state: PassState) -> Floats:
         horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
@@ -304,8 +309,8 @@ class PositionBuilder(Builder):
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        sigma = self.sigma[row] if self.own_sigma[row] else self.sigma[row] * self._scale(pass_state)
-        sigma = np.hypot(sigma, self.interpolated[row])
+        scale = pass_state.scale(self.stated_name) if self.own_sigma[row] else self._scale(pass_state)
+        sigma = np.hypot(self.sigma[row] * scale, self.interpolated[row])
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:

@@ -51,7 +51,8 @@ def static_alignment(first: FirstStretch) -> list[Candidate]:
     rest, magnetic = first.rest, first.magnetic_heading
     if len(first.fixes) or rest is None:
         return []
-    heading, sigma = magnetic if magnetic is not None else (0.0, 1e-3)
+    tilt = first.noise.accel_bias_sigma / first.gravity  # of the levelling, which turns the heading to second order
+    heading, sigma = magnetic if magnetic is not None else (0.0, max(1e-3, float(np.degrees(tilt**2))))
     prior = first.levelled_prior(heading, np.zeros(3), 1e-3, sigma)
     prior = replace(prior, magnetic_stage=None if magnetic is None else first.magnetic_stage)
     source = (

@@ -5,7 +5,7 @@ With whitened residuals r and Jacobian A of all factors at the solution, and the
     x = -(J^T M J)^-1 J^T M r      cov x = (J^T M J)^-1      M = 1 - A (A^T A)^-1 A^T
 
 is what one more iteration of least squares with x as states without priors finds. Tested one by one are the clock
-offset of each position sensor, a jump of it, the lever arm, and scale factors of accelerometer and gyroscope.
+offset of each position sensor, its rate, a jump of it, the lever arm, and scale factors of accelerometer and gyroscope.
 
 Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.4; Rao (1973), Linear statistical inference, 6e.
 """
@@ -22,6 +22,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.states import key, kind_of
@@ -41,7 +42,8 @@ EXCITED = 250.0
 @dataclass(frozen=True)
 class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
-    stamps); ``lever arm`` (m), ``accelerometer scale`` and ``gyro scale`` along the body axis `axis`."""
+    stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale`` and ``gyro
+    scale`` along the body axis `axis`."""
 
     sensor: str
     kind: str
@@ -74,7 +76,7 @@ def sensor_errors(solved: SolvedProblem) -> list[SensorError]:
     for k in np.flatnonzero(known).tolist():
         error = found[k][0]
         constant = k if error.kind == "clock" else constant
-        beside = error.kind in ("clock jump", "lever arm") and known[constant]
+        beside = error.kind in ("clock rate", "clock jump", "lever arm") and known[constant]
         own = np.array([k, constant] if beside else [k])
         covariance = np.linalg.pinv(information[np.ix_(own, own)], hermitian=True)
         value, variance = float(covariance[0] @ score[own]), float(covariance[0, 0])
@@ -142,6 +144,9 @@ def _of_positions(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tup
             continue
         moved = [(part.row, W @ R[k].T @ v[k]) for part, W, k in rows]
         yield SensorError(sensor, "clock"), moved
+        since = np.array([part.name.t_ns - estimate.t_ns[0] for part, _, _ in rows]) / NS
+        since -= since.mean()
+        yield SensorError(sensor, "clock rate"), [(row, t * by) for t, (row, by) in zip(since, moved, strict=True)]
         for first in sorted({n * len(rows) // PARTS for n in range(1, PARTS)} - {0}):
             yield SensorError(sensor, "clock jump", t_ns=rows[first][0].name.t_ns), moved[first:]
         for axis in range(3):

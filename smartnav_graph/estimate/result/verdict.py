@@ -64,6 +64,12 @@ _LATER = "the motion fits with stamps {value:+.1f} s later"
 _SCALED = "of {axis} is {percent:+.1f} % too large by the other sensors"
 LIMITS = {
     "clock": Limit(STATE_S, 4.0, _LATER, "correct its stamps, or its lever arm"),
+    "clock rate": Limit(
+        0.003,
+        3.5,
+        "the motion fits with stamps stretched by {percent:+.1f} %",
+        "correct the clock that is wrong, most likely that of the inertial data",
+    ),
     "clock jump": Limit(1.0, 5.0, _LATER + " from there on", "correct its stamps from there on"),
     "lever arm": Limit(1.5, 4.5, "the motion fits a lever arm {value:+.1f} m longer along {axis}", "correct body_t"),
     "accelerometer scale": Limit(

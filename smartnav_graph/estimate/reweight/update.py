@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import runs
+from smartnav_graph.core.arrays import Mask, runs
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
@@ -50,6 +50,9 @@ LEAST_SIGMA = (0.02, 0.01)
 LEAST_REDUNDANCY = 10.0
 # What the scatter of the fixes by themselves counts, in residuals, where their sigma rises beyond it.
 PRIOR_FIXES = 30.0
+# Stated sigmas are believed unless so large squares are rarer than this; and the most that noise with tails exceeds the
+# sigma of its middle.
+RARE, TAILS = 1e-3, 1.5
 # Share and number of rejected fixes above which the solution is suspect; above the last share whatever their number.
 SUSPECT_SHARE, LEAST_SUSPECTS, MOST_REJECTED = 0.1, 10, 0.15
 # Outliers are looked for when the worst fix of all would be so rare among good ones.
@@ -118,7 +121,7 @@ def _update_noise_and_fixes(
         return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
     if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
-    names = [name for builder, _ in found.values() for name in builder.noise_names]
+    names = [name for builder, _ in found.values() for name in (*builder.noise_names, builder.stated_name)]
     steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in names)
     new, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
     steady = steady and calm
@@ -243,12 +246,13 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassSta
     outside = _position_verdict(builder, found, pass_state).outside() | pass_state.rejected.get(
         builder.name, frozenset()
     )
-    inside = ~(builder.own_sigma | (builder.interpolated > 0))[found.rows] & ~np.isin(found.rows, list(outside))
+    own = builder.own_sigma[found.rows]
+    inside = ~np.isin(found.rows, list(outside)) & (builder.interpolated[found.rows] == 0)
     normalised = (found.residual / found.sigma) ** 2
-    scales = dict(pass_state.noise_scales)
+    scales = {**pass_state.noise_scales, **_stated(builder, found, own & inside, pass_state)}
     parts = zip(builder.noise_names, (slice(0, 2), slice(2, 3)), builder.scatter, LEAST_SIGMA, strict=True)
     for name, axes, known, least in parts:
-        used = inside & (builder.measures_height[found.rows] | (axes.start == 0))
+        used = inside & ~own & (builder.measures_height[found.rows] | (axes.start == 0))
         redundancy = float(found.redundancy[used, axes].sum())
         if redundancy < LEAST_REDUNDANCY:
             continue
@@ -256,6 +260,22 @@ def _rescaled(builder: PositionBuilder, found: FixResiduals, pass_state: PassSta
         sigma = default * pass_state.scale(name)
         scales[name] = _fix_sigma(sigma, square / redundancy, redundancy, default, known, least) / default
     return replace(pass_state, noise_scales=scales)
+
+
+def _stated(builder: PositionBuilder, found: FixResiduals, used: Mask, pass_state: PassState) -> dict[str, float]:
+    """Scale of the stated sigmas, at least 1: by the fixes inside the gate where so large squares are rare, and where
+    the fixes are white noise by themselves of no more than that scatter with tails."""
+    known, name = builder.scatter[0], builder.stated_name
+    counted = used[:, None] & (builder.measures_height[found.rows, None] | (np.arange(3) < 2))
+    redundancy = float(found.redundancy[counted].sum())
+    if known is None or not known.is_noise or redundancy < PRIOR_FIXES:
+        return {}
+    square, before = float(((found.residual / found.sigma)[counted] ** 2).sum()), pass_state.scale(name)
+    if before == 1.0 and chi2.sf(square, redundancy) > RARE:
+        return {}
+    most = max(1.0, TAILS * known.sigma / float(np.median(builder.sigma[found.rows[used], :2])))
+    wanted = np.sqrt((before**2 * square + PRIOR_FIXES) / (redundancy + PRIOR_FIXES))
+    return {name: float(np.clip(wanted, 1.0, most))}
 
 
 def _fix_sigma(

@@ -299,7 +299,8 @@ def test_the_magnetic_heading_of_an_exact_field(heading, roll, pitch):
 def test_a_rest_alone_starts_at_zero_and_says_so():
     session = simulate("static-60s").replace(magnetometer=None)
     start = started(session)
-    assert (start.heading_deg, start.sigma_heading_deg) == (0.0, 1e-3)
+    assert start.heading_deg == 0.0
+    assert 0.01 < start.sigma_heading_deg < 0.1  # the square of a levelling good to 1.5 deg
     assert start.sentence.startswith(
         "No absolute sensor: started from a rest of 29.5 s; heading and position set to zero"
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import recorded, shifted, with_imu
+from sessions import recorded, shifted, with_gnss, with_imu
 
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result import summary
@@ -44,7 +44,7 @@ def found(monkeypatch):
 
 def test_none_is_significant_where_there_is_none(eight, found):
     errors = found(eight)
-    assert {kind for kind, _ in errors} == {"clock", "lever arm", "accelerometer scale", "gyro scale"}
+    assert {kind for kind, _ in errors} == {"clock", "clock rate", "lever arm", "accelerometer scale", "gyro scale"}
     assert all(abs(error.value) < 4.0 * error.sigma for error in errors.values())
 
 
@@ -55,6 +55,13 @@ def assert_near(error: SensorError, value: float) -> None:
 
 def test_a_late_clock(eight, found):
     assert_near(found(shifted(eight, 0.5))["clock", ""], -0.5)  # s
+
+
+def test_a_clock_at_another_rate(eight, found):
+    """Stamps of the fixes that grow by one per cent too much, as beside a slow clock of the inertial data."""
+    since = eight.gnss.t_ns - eight.gnss.t_ns[0]
+    fast = with_gnss(eight, t_ns=eight.gnss.t_ns + since // 100)
+    assert_near(found(fast)["clock rate", ""], -0.01)
 
 
 def test_a_wrong_lever_arm(eight, found):

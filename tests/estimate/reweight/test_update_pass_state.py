@@ -85,6 +85,12 @@ def test_a_sigma_that_came_with_the_data_is_left_alone(drive):
     assert pass_state.scale("gnss") == 1.0
 
 
+@pytest.mark.parametrize(("true", "scale"), [(2.0, 1.0), (2.7, 1.35)])
+def test_stated_sigmas_that_residuals_and_scatter_exceed_are_raised(drive, true, scale):
+    pass_state, _ = learn(drive, with_fixes(drive, [true] * 3, told=[2.0] * 3))
+    assert pass_state.scale("gnss_stated") == pytest.approx(scale, rel=0.1)  # two sigmas of 300 residuals
+
+
 def test_exact_fixes_are_believed_no_better_than_their_clock_allows(drive):
     pass_state, _ = learn(drive, with_fixes(drive, [1e-6, 1e-6, 1e-6]))
     assert 3.0 * pass_state.scale("gnss") >= LEAST_SIGMA[0] - 1e-12
