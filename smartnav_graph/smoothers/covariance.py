@@ -1,12 +1,17 @@
 """Covariance of a linear system, and what its solution fits of every residual.
 
 Forward in time the states of each keyframe are eliminated by an orthogonal transformation: R x_k + S y = d, with y the
-later states that share factors with x_k or with an earlier one. Backwards P_k = R^-1 R^-T + K P_y K^T and P_ky = -K P_y
-with K = R^-1 S. QR is exact where states are weakly held, and this is stable where nothing holds the trajectory (a dead
-reckoning of minutes), where GTSAM's shortcuts of the Bayes tree give up. The states of a whitened row J of the system
-are among those of its first keyframe and their y, so that J P J^T is at hand there.
+later states that share factors with x_k or with an earlier one. Backwards, with K = R^-1 S and a root L of P_y = L L^T,
 
-Source: Rauch, Tung, Striebel (1965), in square-root information form (Bierman 1977, ch. X).
+    P of (x_k, y) = F F^T,    F = [R^-1  -K L; 0  L]
+
+and a QR factorisation brings the rows of F that the keyframe before needs back to a square root. QR is exact where
+states are weakly held, and this is stable where nothing holds the trajectory (a dead reckoning of minutes), where
+GTSAM's shortcuts of the Bayes tree give up. Covariances themselves lose all digits on the way back where neighbouring
+states are tied to each other 10^8 times better than to the world, as by images; their roots do not. The states of a
+whitened row J of the system are among those of its first keyframe and their y, so that J P J^T is at hand there.
+
+Source: Rauch, Tung, Striebel (1965), in square-root form (Bierman 1977, Factorization methods, ch. X).
 """
 
 from __future__ import annotations
@@ -153,6 +158,27 @@ def _eliminated(fronts: _Fronts, columns: _Columns) -> list[Floats]:
     return found
 
 
+def _earlier(conditional: Floats, own: int, later: Floats, first: int, columns: _Columns) -> Floats:
+    """Root F (own + k, own + k) of the covariance F F^T of a group of `own` states and of the k later ones that
+    `conditional` [R S] ties it to; `later` (k, m) is a root of theirs.
+
+    first : column of the group's first state, for the error where R is singular
+    """
+    if len(conditional) < own:
+        raise columns.fault(first + len(conditional))
+    inverse, fault = lapack.dtrtri(conditional[:, :own])
+    if fault or not np.isfinite(inverse).all():
+        raise columns.fault(first + max(fault - 1, 0))
+    size = len(later)
+    if size < later.shape[1]:
+        triangle = lapack.dgeqrf(later.T)[0][:size]
+        later = np.where(_upper(*triangle.shape), triangle, 0.0).T
+    root = np.zeros((own + size, own + later.shape[1]))
+    root[:own, :own], root[:own, own:] = inverse, -(inverse @ conditional[:, own:]) @ later
+    root[own:, own:] = later
+    return root
+
+
 def marginals(
     linear: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]], session: Sequence[int], rows: int
 ) -> Marginals:
@@ -171,28 +197,16 @@ def marginals(
     fronts = _Fronts(linear, rows, columns)
     conditionals = _eliminated(fronts, columns)
     joint, following = np.empty((count, _OWN, _OWN)), np.empty((max(count - 1, 0), _OWN, _OWN))
-    fitted, P = np.zeros(rows), np.zeros((0, 0))
-    session_covariance = P
+    fitted, root = np.zeros(rows), np.zeros((0, 0))
+    session_covariance = root
     for group in reversed(range(len(conditionals))):
-        own, kept = int(columns.own[group]), fronts.kept[group]
-        conditional = conditionals[group]
-        if len(conditional) < own:
-            raise columns.fault(int(columns.first[group]) + len(conditional))
-        inverse, fault = lapack.dtrtri(conditional[:, :own])
-        if fault or not np.isfinite(inverse).all():
-            raise columns.fault(int(columns.first[group]) + max(fault - 1, 0))
-        later = P[kept[:, None], kept]
-        gain = inverse @ conditional[:, own:]
-        cross = -gain @ later
-        P = np.empty((own + len(later),) * 2)
-        P[:own, :own], P[:own, own:], P[own:, :own] = inverse @ inverse.T - cross @ gain.T, cross, cross.T
-        P[own:, own:] = later
+        own = int(columns.own[group])
+        root = _earlier(conditionals[group], own, root[fronts.kept[group]], int(columns.first[group]), columns)
         if group < count:
-            joint[group] = P[:_OWN, :_OWN]
+            joint[group] = root[:_OWN] @ root[:_OWN].T
         else:
-            session_covariance = P
+            session_covariance = root @ root.T
         if group < count - 1:
-            following[group] = P[:_OWN, own : own + _OWN]
-        front = fronts.matrix(group)
-        fitted[fronts.numbers(group)] = ((front @ P) * front).sum(axis=1)
+            following[group] = root[:_OWN] @ root[own : own + _OWN].T
+        fitted[fronts.numbers(group)] = ((fronts.matrix(group) @ root) ** 2).sum(axis=1)
     return Marginals(joint, following, session_covariance, fronts.residual, fitted)
