@@ -53,7 +53,7 @@ def stop_and_go(sway=()):
 
 
 def test_the_rests_of_a_drive_and_nothing_else():
-    samples = ride(stop_and_go(motions._SPRINGS))
+    samples = ride(stop_and_go(motions.SPRINGS))
     rests = found(samples, "car")
     (first, stop) = seconds(rests.rests())[:2]
     assert first[0] == 0.0 and 4.5 < first[1] < 5.2
