@@ -37,6 +37,8 @@ NOTABLE, MOST_CANDIDATES, MOST_STEPS = 2.0, 100, 10
 MAD = 1.4826  # sigma over a median absolute deviation
 LEAST_SIGMA = 0.02  # m
 SHARE = 0.2  # of a step that its two fixes may differ from it by, beside their noise
+# Three sigmas of the difference of two medians of three, in sigmas of the difference of two heights.
+NEAR_SIGMAS = 2.0
 FEW_M = 5.0  # that the height over one or two points may vary by
 ITERATIONS = 20
 
@@ -80,7 +82,8 @@ def height_steps(t_ns: Times, position: Floats, motion: InertialMotion, least: f
     t = (t_ns - motion.start_ns) / NS
     inertial = np.interp(t, STEP_S * (np.arange(len(motion.height)) + 0.5), motion.height)
     level = agrees_with_neighbours(t_ns, position[:, :2])
-    left, found = position[:, 2] - inertial, dict[int, tuple[float, float]]()
+    raw, left = position[:, 2], position[:, 2] - inertial
+    found: dict[int, tuple[float, float]] = {}
     while len(found) < MOST_STEPS:
         best, size, sigma, most = 0, 0.0, 0.0, 0.0
         jump = _jumps(left)
@@ -91,12 +94,17 @@ def height_steps(t_ns: Times, position: Floats, motion: InertialMotion, least: f
             s, spread, gain = _step(t, left, row)
             if abs(jump[row - 1] - s) > SIGNIFICANT * noise + SHARE * abs(s):
                 continue  # the inertial height bends there: between two fixes there is no such step
+            if abs(_near_step(left, row) - s) > NEAR_SIGMAS * noise + SHARE * abs(s):
+                continue  # nor between three before and three after
+            if _near_step(raw, row) * np.sign(s) < 0.5 * abs(s):
+                continue  # the inertial height steps, not the fixes
             if abs(s) > max(SIGNIFICANT * spread, least) and gain > most:
                 best, size, sigma, most = int(row), s, spread, gain
         if not best:
             break
         found[best] = size, sigma
-        left = left - size * (np.arange(len(left)) >= best)
+        after = np.arange(len(left)) >= best
+        left, raw = left - size * after, raw - size * after
         for row in found:  # each once more without the others
             after = np.arange(len(left)) >= row
             with_it = left + found[row][0] * after
@@ -149,6 +157,12 @@ def _jumps(left: Floats) -> Floats:
     step = np.diff(left)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(step, 4, mode="reflect"), 9)
     return np.asarray(step - np.median(around, axis=1))
+
+
+def _near_step(left: Floats, row: int) -> float:
+    """Median of three heights from a row on less that of the three before it and the rise between, m."""
+    rise = np.median(np.delete(np.diff(left[row - LEAST_FIXES : row + LEAST_FIXES]), LEAST_FIXES - 1))
+    return float(np.median(left[row : row + 3]) - np.median(left[row - 3 : row]) - 3.0 * rise)
 
 
 def _candidates(jump: Floats, noise: float) -> Indices:
