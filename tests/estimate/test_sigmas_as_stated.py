@@ -8,6 +8,7 @@ import pytest
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.problem import prepare
 from smartnav_graph.simulation.degrade import Degrade, degrade
+from smartnav_graph.simulation.fixes import Outliers
 
 
 def with_sigma(session, sigma):
@@ -34,3 +35,12 @@ def test_sigmas_that_agree_or_are_cautious_stay(kitti, sigma):
 def test_motion_is_no_scatter(kitti):
     problem = prepare(with_sigma(kitti, 0.02), Config())
     assert (problem.session.gnss.sigma == 0.02).all()
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fifth_of_outliers_is_no_scatter(kitti, seed, causal):
+    outliers = Outliers("isolated", 0.2, 50.0, 200.0)
+    noisy = degrade(kitti, Degrade(gnss_white=3.0, outliers=outliers), seed)
+    problem = prepare(with_sigma(noisy, 3.0), Config(), causal=causal)
+    assert (problem.session.gnss.sigma == 3.0).all()

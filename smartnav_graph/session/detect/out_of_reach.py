@@ -1,8 +1,9 @@
 """Positions that one device cannot have visited all: those out of reach of the largest set that it can.
 
 Two positions are within reach of each other if no more than the fastest motion, some slack and their noise lie between
-them. Reach is transitive, so that the largest set is the heaviest path through the parts between jumps. It needs no
-other sensor and no model: where half of all fixes lie elsewhere, a solution would lie in between.
+them. The largest set is the longest path through the parts between jumps, without a few rows at their edges where need
+be: an outlier within slack and noise of a part may be out of reach of the next. It needs no other sensor and no model:
+where half of all fixes lie elsewhere, a solution would lie in between.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ FAST_M_S, SLACK_M = 100.0, 100.0
 SIGMAS = 4.0
 # A device that is faster has most of its lowest speeds below the limit, over one of these numbers of rows.
 LOW, SPANS, FASTER = 0.25, (1, 2, 3, 4), 2.0
+# Rows at each edge of a part that a path may leave out, and rows before one that are looked at together.
+EDGE, LATEST = 3, 256
 
 
 def out_of_reach(stream: Positioned, position: Floats, at_first: Mask | None = None) -> Mask:
@@ -67,17 +70,29 @@ class _Reach:
         return np.asarray(self._distance(rows, others) <= self.speed * np.abs(self.t[others] - self.t[rows]) + slack)
 
     def _largest(self, rows: Indices) -> Indices:
-        """The largest set within reach of each other, of rows in time order."""
-        parts = np.split(rows, np.flatnonzero(~self.between(rows[:-1], rows[1:])) + 1)
-        first, last = (np.array([part[end] for part in parts]) for end in (0, -1))
-        size, before = np.array([len(part) for part in parts]), np.full(len(parts), -1)
-        for k in range(1, len(parts)):
-            within = np.flatnonzero(self.between(last[:k], first[k : k + 1]))
-            if len(within):
-                before[k] = within[np.argmax(size[within])]
-                size[k] += size[before[k]]
+        """The longest path through rows in time order, from row to row within a part, and from the end of one part to
+        the beginning of a later one, where these are within reach."""
+        n, near = len(rows), self.between(rows[:-1], rows[1:])
+        parts = np.split(np.arange(n), np.flatnonzero(~near) + 1)
+        ends = np.concatenate([part[-EDGE:] for part in parts])
+        begins = np.zeros(n, dtype=bool)
+        begins[np.concatenate([part[:EDGE] for part in parts])] = True
+        size, before = np.ones(n, dtype=np.intp), np.full(n, -1)
+        most = np.zeros(n + 1, dtype=np.intp)  # of the rows before
+        for k in range(n):
+            if k and near[k - 1]:
+                size[k], before[k] = size[k - 1] + 1, k - 1
+            last = int(np.searchsorted(ends, k)) if begins[k] else 0
+            while last > 0 and most[ends[last - 1] + 1] >= size[k]:  # the latest first
+                some = ends[max(last - LATEST, 0) : last]
+                within = some[self.between(rows[some], rows[k : k + 1])]
+                if len(within) and size[within].max() >= size[k]:
+                    before[k] = within[np.argmax(size[within])]
+                    size[k] = size[before[k]] + 1
+                last -= len(some)
+            most[k + 1] = max(most[k], size[k])
         found, k = [], int(np.argmax(size))
         while k >= 0:
-            found.append(parts[k])
+            found.append(k)
             k = int(before[k])
-        return np.concatenate(found[::-1])
+        return rows[found[::-1]]

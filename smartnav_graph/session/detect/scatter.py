@@ -7,7 +7,8 @@ white part of the fixes and the motion that no cubic follows. With weights w_j o
 
     r = p - sum_j w_j p_j        var r = sigma^2 (1 + sum_j w_j^2)
 
-and a low quantile of the normalised squares gives sigma, whatever outliers there are. At twice the spacing white noise
+and a low quantile of the normalised squares gives sigma. An outlier spoils five residuals, its own most: the
+worst are left out one after the other, and were outliers if far less scatter is left. At twice the spacing white noise
 leaves the same sigma, motion a larger one; and neighbouring r of white noise are of opposite sign (their correlation is
 -0.8), those of a motion are not. Fixes too far apart follow no motion, and their scatter is an upper bound.
 
@@ -17,14 +18,14 @@ a low quantile over the frequencies leaves out (Welch 1967, IEEE Trans. Audio El
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal.windows import hann
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import Floats, Mask, Times
+from smartnav_graph.core.arrays import Floats, Indices, Mask, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
 
@@ -33,6 +34,8 @@ LEAST_FIXES = 12
 QUANTILE = 0.25
 # Share of good fixes that agree with their neighbours.
 AGREES = 0.999
+# Fixes outside this share of good ones may be outliers; they are, where the scatter without them is less than this share.
+SUSPECT, OUTLYING = 0.95, 0.5
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
 # and longest median spacing.
 NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
@@ -79,10 +82,30 @@ def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatte
     t_ns, position, units = t_ns[new], position[new], units[new]
     if len(t_ns) < LEAST_FIXES:
         return None
+    found = _scatter(t_ns, position, units)
+    kept = _without_outliers(t_ns, position, units) if found.is_noise else np.arange(len(t_ns))
+    cleaned = _scatter(t_ns[kept], position[kept], units[kept])
+    return replace(cleaned, rows=found.rows) if cleaned.sigma < OUTLYING * found.sigma else found
+
+
+def _scatter(t_ns: Times, position: Floats, units: Floats) -> Scatter:
     near, far = (normalised_residuals(t_ns, position, spacing) / units for spacing in (1, 2))
     sigma, sign = _sigma(near), float(np.nanmean(np.sign(near[1:] * near[:-1])))
     close = float(np.median(np.diff(t_ns))) / NS < NOISE_SPACING_S
     return Scatter(sigma, close and sign < NOISE_SIGN and _sigma(far) < NOISE_GROWTH * sigma, len(t_ns))
+
+
+def _without_outliers(t_ns: Times, position: Floats, units: Floats) -> Indices:
+    """Rows without those that disagree with their neighbours most, one among neighbours at a time; at least half."""
+    kept, limit = np.arange(len(t_ns)), float(chi2(position.shape[1]).ppf(SUSPECT))
+    while True:
+        residual = normalised_residuals(t_ns[kept], position[kept]) / units[kept]
+        square = np.pad(np.nan_to_num((residual**2).sum(axis=1)), 2)
+        off = square[2:-2] > limit * max(_sigma(residual), 1e-9) ** 2
+        off &= square[2:-2] >= sliding_window_view(square, 5).max(axis=1)
+        if not off.any() or 2 * (len(kept) - int(off.sum())) < len(t_ns) or len(kept) - off.sum() < LEAST_FIXES:
+            return kept
+        kept = kept[~off]
 
 
 def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:

@@ -88,3 +88,17 @@ def test_unknown_heights_are_no_distance():
     position = drive()
     position[::2, 2] = np.nan
     assert not out(position + np.array([0, 0, 5e3])).any()
+
+
+def test_outliers_at_the_edge_of_reach_do_not_part_the_drive():
+    """Three in a row, each within reach of the drive and the middle one of no other."""
+    position = drive(step_s=0.5)
+    position[90:93] += np.array([[100.0, 0, 0], [-120.0, 0, 0], [110.0, 0, 0]])
+    assert np.flatnonzero(out(position, 0.5)).tolist() == [91]
+
+
+def test_long_recordings_take_no_longer_than_a_moment():
+    """Ten hours, a tenth elsewhere."""
+    n = 36000
+    there = np.random.default_rng(4).random(n) < 0.1
+    np.testing.assert_array_equal(out(drive(n) + there[:, None] * [0, 3e5, 0]), there)

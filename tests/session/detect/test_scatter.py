@@ -40,6 +40,23 @@ def test_white_noise_is_found_whatever_the_speed_and_outliers(dim: int) -> None:
     assert 0.85 * 2.5 < found.sigma < 1.45 * 2.5
 
 
+@pytest.mark.parametrize("share", [0.2, 0.3])
+def test_many_outliers_are_no_scatter(share: float) -> None:
+    """They spoil most of the residuals, and look like white noise."""
+    rng = np.random.default_rng(9)
+    position = rng.normal(0.0, 2.5, (400, 2))
+    position[rng.random(400) < share] += 100.0
+    found = scatter(stamps(400), position)
+    assert found is not None and 0.6 * 2.5 < found.sigma < 1.8 * 2.5
+
+
+@pytest.mark.parametrize("rows", [40, 400])
+def test_no_noise_is_left_out(rows: int) -> None:
+    """Without outliers the scatter is that of all fixes."""
+    sigmas = [scatter(stamps(rows), np.random.default_rng(k).normal(0.0, 2.5, (rows, 2))).sigma for k in range(20)]
+    assert np.mean(sigmas) == pytest.approx(2.5, rel=0.1)
+
+
 def test_motion_is_no_noise() -> None:
     t = np.arange(300.0)
     position = np.stack([20 * np.sin(0.9 * t), 20 * np.cos(0.9 * t)], axis=1)
