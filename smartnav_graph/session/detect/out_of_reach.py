@@ -2,8 +2,8 @@
 
 Two positions are within reach of each other if no more than the fastest motion, some slack and their noise lie between
 them. The largest set is the longest path through the parts between jumps, without a few rows at their edges where need
-be: an outlier within slack and noise of a part may be out of reach of the next. It needs no other sensor and no model:
-where half of all fixes lie elsewhere, a solution would lie in between.
+be: an outlier within slack and noise of a part may be out of reach of the next. Robust estimation finds such outliers.
+It needs no other sensor and no model: where half of all fixes lie elsewhere, a solution would lie in between.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class _Reach:
 
     def _largest(self, rows: Indices) -> Indices:
         """The longest path through rows in time order, from row to row within a part, and from the end of one part to
-        the beginning of a later one, where these are within reach."""
+        the beginning of a later one, where these are within reach; and rows within reach of most beside them."""
         n, near = len(rows), self.between(rows[:-1], rows[1:])
         parts = np.split(np.arange(n), np.flatnonzero(~near) + 1)
         ends = np.concatenate([part[-EDGE:] for part in parts])
@@ -95,4 +95,11 @@ class _Reach:
         while k >= 0:
             found.append(k)
             k = int(before[k])
-        return rows[found[::-1]]
+        kept = np.array(found[::-1])
+        others = np.setdiff1d(np.arange(n), kept)
+        after, count = np.searchsorted(kept, others), np.zeros(len(others), dtype=np.intp)
+        for shift in range(-EDGE, EDGE):
+            beside = kept[np.clip(after + shift, 0, len(kept) - 1)]
+            count += self.between(rows[beside], rows[others]) & (np.abs(beside - others) <= EDGE)
+        found.extend(others[count > EDGE])
+        return rows[np.unique(found)]

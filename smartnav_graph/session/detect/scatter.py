@@ -34,7 +34,7 @@ LEAST_FIXES = 12
 QUANTILE = 0.25
 # Share of good fixes that agree with their neighbours.
 AGREES = 0.999
-# Fixes outside this share of good ones may be outliers; they are, where the scatter without them is less than this share.
+# Fixes outside this share of good ones may be outliers; they are, where this share of the scatter is left without them.
 SUSPECT, OUTLYING = 0.95, 0.5
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
 # and longest median spacing.

@@ -40,14 +40,13 @@ def drive():
 
 
 def with_fixes(drive, sigma, told=None, seed: int = 0, off=()):
-    """The drive with noisy fixes; `told` their sigma columns; `off` rows moved 30 to 75 m away, within
-    reach of each other."""
+    """The drive with noisy fixes; `told` their sigma columns; `off` rows moved 30 to 120 m away."""
     rng = np.random.default_rng(seed)
     fix = drive.session.gnss
     enu = fix.enu + np.array(sigma) * rng.standard_normal(fix.enu.shape)
     for row in off:
         angle = rng.uniform(0, 2 * np.pi)
-        enu[row] += rng.uniform(30, 75) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        enu[row] += rng.uniform(30, 120) * np.array([np.cos(angle), np.sin(angle), 0.0])
     told = None if told is None else np.tile(told, (len(fix), 1))
     return drive.session.replace(gnss=GnssFix(t_ns=fix.t_ns, enu=enu, sigma=told))
 

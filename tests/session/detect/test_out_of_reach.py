@@ -91,10 +91,10 @@ def test_unknown_heights_are_no_distance():
 
 
 def test_outliers_at_the_edge_of_reach_do_not_part_the_drive():
-    """Three in a row, each within reach of the drive and the middle one of no other."""
+    """Three in a row, each within reach of the drive, not of each other."""
     position = drive(step_s=0.5)
     position[90:93] += np.array([[100.0, 0, 0], [-120.0, 0, 0], [110.0, 0, 0]])
-    assert np.flatnonzero(out(position, 0.5)).tolist() == [91]
+    assert not out(position, 0.5).any()
 
 
 def test_long_recordings_take_no_longer_than_a_moment():
