@@ -12,7 +12,7 @@ doubtful : the result may be wrong by more than its covariance says
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -193,11 +193,14 @@ def _clocks(inputs: VerdictInputs) -> Iterator[Reason]:
 
 def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
     """Errors that have no state, or are more than its prior allows: the clearest one of each sensor. Fixes that are
-    filtered lag by more than a constant time, which looks like a lever arm along the motion."""
+    filtered lag by more than a constant time, which looks like a lever arm along the motion. Sigmas are as wide as the
+    residuals of the sensor show."""
     worst: dict[str, SensorError] = {}
+    misfit = inputs.fit.per_dof()
     session = inputs.solved.problem.session
     for error in sensor_errors(inputs.solved) if inputs.together else ():
         limit = LIMITS[error.kind]
+        error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
         clear = abs(error.value) > max(limit.size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
         known = worst.get(error.sensor)
