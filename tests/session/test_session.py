@@ -72,5 +72,5 @@ def test_an_unnamed_sensor_sits_at_the_origin_of_the_body():
 @pytest.mark.parametrize("rows", [0, 1])
 def test_without_inertial_data_nothing_goes(rows):
     imu = None if rows == 0 else example(Imu, 1)
-    with pytest.raises(SessionError, match=r"at least two rows; import imu\.parquet"):
+    with pytest.raises(SessionError, match=r"at least two rows; record the IMU too"):
         Session(imu=imu).require_imu()
