@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
@@ -34,6 +34,8 @@ from smartnav_graph.session.stream import Positioned
 
 # Factor on the gate's square for fixes whose sigma was estimated.
 ESTIMATED_TAIL = 4.0
+# Where fixes are believed more than this (m) from the first, least squares follows outliers, and hides them.
+FIRST_SIGMA = 0.03
 UNKNOWN_HEIGHT_SIGMA = 1e4  # m, of a horizontal fix
 LEAST_WEIGHT = 1e-4  # below it a row is left out
 
@@ -209,8 +211,15 @@ class PositionBuilder(Builder):
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
         """Sigmas (n, 3) m after the noise scales of this sensor, with the error of interpolated rows."""
-        scale = np.where(self.own_sigma[:, None], pass_state.scale(self.stated_name), self._scale(pass_state))
-        return np.hypot(self.sigma * scale, self.interpolated[:, None])
+        return self._scaled(np.arange(len(self.position)), pass_state)
+
+    def _scaled(self, rows: Indices, pass_state: PassState) -> Floats:
+        """Sigmas (m, 3) of rows: those found are `FIRST_SIGMA` at least until outliers have been looked for."""
+        own = self.own_sigma[rows, None]
+        least = 0.0 if pass_state.stage == LAST_STAGE else FIRST_SIGMA
+        found = np.maximum(self.sigma[rows] * self._scale(pass_state), least)
+        sigma = np.where(own, self.sigma[rows] * pass_state.scale(self.stated_name), found)
+        return np.hypot(sigma, self.interpolated[rows, None])
 
     def _scale(self, pass_state: PassState) -> Floats:
         horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
@@ -309,8 +318,7 @@ class PositionBuilder(Builder):
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        scale = pass_state.scale(self.stated_name) if self.own_sigma[row] else self._scale(pass_state)
-        sigma = np.hypot(self.sigma[row] * scale, self.interpolated[row])
+        sigma = self._scaled(np.array([row]), pass_state)[0]
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:
