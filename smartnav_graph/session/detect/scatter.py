@@ -85,7 +85,9 @@ def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatte
     found = _scatter(t_ns, position, units)
     kept = _without_outliers(t_ns, position, units) if found.is_noise else np.arange(len(t_ns))
     cleaned = _scatter(t_ns[kept], position[kept], units[kept])
-    return replace(cleaned, rows=found.rows) if cleaned.sigma < OUTLYING * found.sigma else found
+    few = 2 * len(kept) > len(t_ns) + 1  # as many as may be left out are no outliers: the scatter changes with time
+    outlying = (few or cleaned.is_noise) and cleaned.sigma < OUTLYING * found.sigma
+    return replace(cleaned, rows=found.rows) if outlying else found
 
 
 def _scatter(t_ns: Times, position: Floats, units: Floats) -> Scatter:
