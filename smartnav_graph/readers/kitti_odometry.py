@@ -15,7 +15,7 @@ from smartnav_graph.core.arrays import Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.reference import pose_columns
-from smartnav_graph.readers.source import Reader, build_session, mount
+from smartnav_graph.readers.source import Reader, build_session, mount, only_folder
 from smartnav_graph.readers.text import read_text
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
@@ -31,12 +31,7 @@ NAV_R_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def _root(source: str) -> Path | None:
     """The folder with calib.txt and pictures: `source`, or the only one in it."""
-    try:
-        folders = [Path(source), *sorted(Path(source).glob("*/"))]
-        found = [f for f in folders if (f / "calib.txt").is_file() and any((f / p).is_dir() for p in PICTURES)]
-    except (OSError, ValueError):  # ValueError: a zero byte in the name
-        return None
-    return found[0] if len(found) == 1 else None
+    return only_folder(source, lambda f: (f / "calib.txt").is_file() and any((f / p).is_dir() for p in PICTURES))
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:

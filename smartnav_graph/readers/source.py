@@ -63,6 +63,16 @@ def first_bytes(source: str, count: int = 8192) -> bytes:
         return b""
 
 
+def only_folder(source: str, holds: Callable[[Path], bool], depth: int = 1) -> Path | None:
+    """The folder that `holds` what is wanted: `source`, or the only one in it, down to `depth` levels; never raises."""
+    try:
+        folders = [Path(source), *(f for level in range(depth) for f in sorted(Path(source).glob("*/" * (level + 1))))]
+        found = [folder for folder in folders if holds(folder)]
+    except (OSError, ValueError):  # ValueError: a zero byte in the name
+        return None
+    return found[0] if len(found) == 1 else None
+
+
 def vector_columns(template: str, rows: Floats, axes: str = "xyz") -> Table:
     """Columns of the rows (n, k) of a vector: ``{}`` in `template` becomes the axis."""
     return {template.format(axis): column for axis, column in zip(axes, rows.T, strict=True)}

@@ -127,6 +127,10 @@ class TextTable:
             rows[:, column] = numbers
         return rows if len(names) > 1 else rows[:, 0]
 
+    def optional(self, name: str) -> Floats | None:
+        """A column (n,) as numbers, as `floats`; None where the file has none of this name."""
+        return self.floats(name) if name in self.cells else None
+
     def ints(self, name: str) -> Times:
         """One column as int64; every cell must hold a whole number, be it written with an exponent."""
         try:

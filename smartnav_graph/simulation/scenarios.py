@@ -23,7 +23,7 @@ from smartnav_graph.simulation import motions, thesis
 from smartnav_graph.simulation.cameras import ON_PHONE, PHONE_CAMERA, Faults, PictureModel, SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
 from smartnav_graph.simulation.recording import Scenario
-from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
+from smartnav_graph.simulation.scenes import FurnishedRoom
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory
 
@@ -81,18 +81,6 @@ _ROOM = SimulatedCamera(
     faults=Faults(lost=0.01),
 )
 _RENDERED = replace(_ROOM, tracked=False, pictures=PictureModel())
-_TROLLEY = motions.Corridors()
-_CORRIDORS = SimulatedCamera(
-    camera=PHONE_CAMERA,
-    mount=ON_PHONE,
-    scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
-    rate_hz=1.25,
-    range_m=(0.3, 40.0),
-    count=(15, 60),
-    pairs=(1, 2),  # those that `smartnav match` makes of such images: up to 2 s apart
-    faults=Faults(outliers=(0.1, 0.3)),
-)
-
 SCENARIOS: dict[str, Scenario] = {
     s.name: s
     for s in (
@@ -131,7 +119,12 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("rendered-room-10s", 10.0, motions.in_a_room, profile="galaxy-s2", camera=_RENDERED),
         Scenario("room-30s", 30.0, motions.in_a_room, profile="galaxy-s2", camera=_ROOM),
         Scenario(
-            "trolley-20min", 1200.0, _TROLLEY, profile="galaxy-s2-warming", camera=_CORRIDORS, rest_sigma_m_s=5e-4
+            "trolley-20min",
+            1200.0,
+            thesis.TROLLEY,
+            profile="galaxy-s2-warming",
+            camera=thesis.CORRIDOR_CAMERA,
+            rest_sigma_m_s=5e-4,
         ),
         *thesis.SCENARIOS,
     )

@@ -28,7 +28,17 @@ from smartnav_graph.simulation.trajectory import Leg, Legs, Trajectory
 OUTAGES = ((240.0, 12.0), (430.0, 30.0), (700.0, 8.0), (905.0, 60.0), (1290.0, 20.0), (1610.0, 40.0), (1930.0, 10.0))
 
 _DRIVE = TownDrive()
-_TROLLEY = motions.Corridors()
+TROLLEY = motions.Corridors()
+CORRIDOR_CAMERA = SimulatedCamera(
+    camera=PHONE_CAMERA,
+    mount=ON_PHONE,
+    scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=TROLLEY.spacing_m, per_m2=30.0),
+    rate_hz=1.25,
+    range_m=(0.3, 40.0),
+    count=(15, 60),
+    pairs=(1, 2),  # those that `smartnav match` makes of such images: up to 2 s apart
+    faults=Faults(outliers=(0.1, 0.3)),
+)
 
 
 def flat(seconds: float, rng: np.random.Generator) -> Trajectory:
@@ -68,22 +78,13 @@ _OUTDOOR = Scenario(
 _INDOOR = Scenario(
     "thesis-indoor",
     1200.0,
-    _TROLLEY,
+    TROLLEY,
     profile="galaxy-s2-warming",
     control=True,
     control_arm=(0.15, -0.25, -1.0),
     control_rest_s=9.0,
     magnetometer=MagnetometerModel(rate_hz=100.0),
-    camera=SimulatedCamera(
-        camera=PHONE_CAMERA,
-        mount=ON_PHONE,
-        scene=CorridorGrid(nodes=(5, 5), origin=(4, 0), spacing_m=_TROLLEY.spacing_m, per_m2=30.0),
-        rate_hz=1.25,
-        range_m=(0.3, 40.0),
-        count=(15, 60),
-        pairs=(1, 2),
-        faults=Faults(outliers=(0.1, 0.3)),
-    ),
+    camera=CORRIDOR_CAMERA,
     rest_sigma_m_s=5e-4,
 )
 _COURTYARD = Scenario(

@@ -183,7 +183,7 @@ def _add_sensors(log: _Records, line: tuple[int, float, int], parts: LogParts, r
 
 def _fixes(table: TextTable, t_ns: Times) -> LoggedFixes:
     table.require(["lat", "lon"])
-    north, east, down = (table.floats(f"vel{axis}") if f"vel{axis}" in table.cells else None for axis in "NED")
+    north, east, down = (table.optional(f"vel{axis}") for axis in "NED")
     velocity = None if north is None or east is None or down is None else np.stack([east, north, -down], axis=-1)
     columns = {name: table.floats(name) for name in ("hMSL", "hAcc", "vAcc", "sAcc") if name in table.cells}
     return LoggedFixes(

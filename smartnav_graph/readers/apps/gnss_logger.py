@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Mask, Times
+from smartnav_graph.core.arrays import Mask, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro, read_vector
@@ -193,20 +193,17 @@ def _add_fixes(parts: LogParts, fixes: TextTable, offset: int) -> None:
 
 
 def _fixes(table: TextTable, t_ns: Times) -> LoggedFixes:
-    def column(name: str) -> Floats | None:
-        return table.floats(name) if name in table.cells else None
-
     return LoggedFixes(
         t_ns,
         table.floats("latitudedegrees"),
         table.floats("longitudedegrees"),
-        height=column("altitudemeters"),
-        horizontal=column("accuracymeters"),
-        vertical=column("verticalaccuracymeters"),
-        speed=column("speedmps"),
-        course=column("bearingdegrees"),
-        speed_sigma=column("speedaccuracymps"),
-        course_sigma=column("bearingaccuracydegrees"),
+        height=table.optional("altitudemeters"),
+        horizontal=table.optional("accuracymeters"),
+        vertical=table.optional("verticalaccuracymeters"),
+        speed=table.optional("speedmps"),
+        course=table.optional("bearingdegrees"),
+        speed_sigma=table.optional("speedaccuracymps"),
+        course_sigma=table.optional("bearingaccuracydegrees"),
     )
 
 

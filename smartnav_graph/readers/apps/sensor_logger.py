@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro
@@ -213,20 +212,17 @@ def _fixes(table: TextTable) -> LoggedFixes:
     table.require(["time", "latitude", "longitude"])
     table = table.rows(table.known("time"))
 
-    def column(name: str) -> Floats | None:
-        return table.floats(name) if name in table.cells else None
-
     return LoggedFixes(
         table.times("time", 1),
         table.floats("latitude"),
         table.floats("longitude"),
-        height=column("altitude"),
-        horizontal=column("horizontalaccuracy"),
-        vertical=column("verticalaccuracy"),
-        speed=column("speed"),
-        course=column("bearing"),
-        speed_sigma=column("speedaccuracy"),
-        course_sigma=column("bearingaccuracy"),
+        height=table.optional("altitude"),
+        horizontal=table.optional("horizontalaccuracy"),
+        vertical=table.optional("verticalaccuracy"),
+        speed=table.optional("speed"),
+        course=table.optional("bearing"),
+        speed_sigma=table.optional("speedaccuracy"),
+        course_sigma=table.optional("bearingaccuracy"),
     )
 
 

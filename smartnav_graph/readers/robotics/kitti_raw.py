@@ -17,7 +17,7 @@ from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import quaternion
-from smartnav_graph.readers.source import Reader, build_session, inertial_columns, mount, vector_columns
+from smartnav_graph.readers.source import Reader, build_session, inertial_columns, mount, only_folder, vector_columns
 from smartnav_graph.readers.stamps import ns_from_date
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
@@ -30,13 +30,12 @@ _CALIBRATION = ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt", "calib_cam_to_
 
 
 def _root(source: str) -> Path | None:
-    """The folder of the drive: `source`, or the only such folder in it or one level below. Never raises."""
-    try:
-        folders = [Path(source), *sorted(Path(source).glob("*/")), *sorted(Path(source).glob("*/*/"))]
-        found = [f for f in folders if (f / "oxts" / "timestamps.txt").is_file() and (f / "oxts" / "data").is_dir()]
-    except (OSError, ValueError):  # ValueError: a zero byte in the name
-        return None
-    return found[0] if len(found) == 1 else None
+    """The folder of the drive: `source`, or the only such folder in it or one level below."""
+
+    def holds(folder: Path) -> bool:
+        return (folder / "oxts" / "timestamps.txt").is_file() and (folder / "oxts" / "data").is_dir()
+
+    return only_folder(source, holds, depth=2)
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
