@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "smartnav_graph"
 # From the ground up: a folder imports only from itself and from those before it.
 ORDER = (
     *("core", "session", "readers", "simulation", "vision", "graph", "factors", "smoothers", "estimate"),
-    *("evaluation", "output", "cli", "__main__"),
+    *("evaluation", "calibrate", "output", "cli", "__main__"),
 )
 API = "__init__"  # it alone may import everything
 HEAVY = {"rerun", "cv2", "pycolmap", "pandas", "matplotlib"}
@@ -20,7 +20,7 @@ HEAVY = {"rerun", "cv2", "pycolmap", "pandas", "matplotlib"}
 FOLDERS, FILE_LINES, FUNCTION_LINES = 13, 400, 60
 ANY = 60  # uses of typing.Any in the package
 # Names that have one role in every module of a kind; they are used with the name of the module.
-SAME_ROLE = {"build", "draw", "load", "read", "replay", "smooth"}
+SAME_ROLE = {"build", "draw", "fit", "load", "read", "replay", "smooth"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

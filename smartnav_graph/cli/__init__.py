@@ -37,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "replay": ("runs", "Replay", "compute the causal trajectory of a session, one window at a time"),
     "evaluate": ("inspection", "Evaluate", "compare a run with a reference trajectory"),
     "intervals": ("intervals", "Intervals", "drift between fixes (simulated outages)"),
+    "calibrate": ("calibrate", "Calibrate", "calibrate sensors, camera, clocks; apply, show or compare a calibration"),
     "explain": ("inspection", "Explain", "explain which measurements determine the state of a run at one epoch"),
     "compare": ("inspection", "Compare", "compare a run with another run"),
     "export": ("runs", "Export", "export a run as TUM, KML, GeoJSON, GPX or CSV, or its images with EXIF"),
@@ -97,6 +98,7 @@ def _run(name: str, rest: list[str]) -> int:
             kind = command_class(name)
         from smartnav_graph.cli.options import parse
 
+        kind, name, rest = kind.narrowed(name, rest)
         command = parse(kind, name, rest)
         logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
         return command.run() or 0

@@ -39,6 +39,11 @@ class Command:
         """Defaults that depend on the arguments; None for those of the class."""
         return None
 
+    @classmethod
+    def narrowed(cls, name: str, arguments: list[str]) -> tuple[type[Command], str, list[str]]:
+        """The class, name and arguments of the command that is meant, where the first argument is a sub-command."""
+        return cls, name, arguments
+
     def run(self) -> int | None:
         """Execute the command; the exit code, where it is not 0."""
         raise NotImplementedError

@@ -164,7 +164,7 @@ def calibrate(session: Session, notes: Notes) -> Session:
     notes.calibration = known or Calibration()
     if known is None or known.imu_errors == ImuErrors():
         return session
-    imu = known.imu_errors.corrected(session.require_imu())
+    imu = known.imu_errors.corrected(session.require_imu(), session.temperature)
     return session.replace(imu=imu, calibration=replace(known, imu_errors=ImuErrors()))
 
 

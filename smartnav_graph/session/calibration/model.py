@@ -16,10 +16,14 @@ import cattrs
 import numpy as np
 import tomli_w
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.session.calibration.camera import Camera
-from smartnav_graph.session.streams import Imu
+from smartnav_graph.session.calibration.pieces import Piece
+from smartnav_graph.session.streams import Imu, Temperature
+
+SCHEMA = 2  # of calibration.toml: 2 has pieces and the temperature of biases; 1 is read too
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -190,12 +194,18 @@ class ImuErrors:
 
     accel_matrix, gyro_matrix : row-major (3, 3), scale factors and misalignments; accel_bias m/s^2, gyro_bias rad/s :
     means of the bias states of a session
+    accel_temperature, gyro_temperature : row-major (3, k), unit/K^j for j = 1 .. k: the biases at temperature T are
+    bias + sum_j coefficient_j (T - temperature_c)^j; no T beyond `temperature_range_c` counts (no extrapolation)
     """
 
     accel_matrix: tuple[float, ...] = _IDENTITY
     gyro_matrix: tuple[float, ...] = _IDENTITY
     accel_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    accel_temperature: tuple[float, ...] = ()
+    gyro_temperature: tuple[float, ...] = ()
+    temperature_c: float = 25.0
+    temperature_range_c: tuple[float, float] = (25.0, 25.0)
 
     def __post_init__(self) -> None:
         for name in ("accel_matrix", "gyro_matrix"):
@@ -205,24 +215,41 @@ class ImuErrors:
                 raise CalibrationError(
                     "calibration.toml", f"{name} = {list(matrix)}", expected, "turn axes in a reader"
                 )
-        if not all(map(math.isfinite, (*self.accel_bias, *self.gyro_bias))):
+        by_temperature = (*self.accel_temperature, *self.gyro_temperature)
+        numbers = (*self.accel_bias, *self.gyro_bias, *by_temperature, self.temperature_c, *self.temperature_range_c)
+        if not all(map(math.isfinite, numbers)):
             raise CalibrationError("calibration.toml", f"{self}", "finite biases", "give m/s^2 and rad/s")
+        lengths = len(self.accel_temperature), len(self.gyro_temperature)
+        if any(length % 3 for length in lengths) or self.temperature_range_c[0] > self.temperature_range_c[1]:
+            expected = "as many coefficients for each axis, and a range of temperature from low to high"
+            raise CalibrationError("calibration.toml", f"{self}", expected, "see [imu_errors]")
 
-    def corrected(self, imu: Imu) -> Imu:
-        """True rate and force, matrix (reading - bias); the same object where there is nothing to do."""
+    def corrected(self, imu: Imu, temperature: Temperature | None = None) -> Imu:
+        """True rate and force, matrix (reading - bias); the same object where there is nothing to do.
+
+        temperature : of the sensors, for the biases that depend on it; without it they are those at `temperature_c`
+        """
         if self == ImuErrors():
             return imu
         accel, gyro = (np.reshape(matrix, (3, 3)).T for matrix in (self.accel_matrix, self.gyro_matrix))
-        return dataclasses.replace(
-            imu,
-            accel=(imu.accel - np.array(self.accel_bias)) @ accel,
-            gyro=(imu.gyro - np.array(self.gyro_bias)) @ gyro,
-        )
+        accel_bias, gyro_bias = np.array(self.accel_bias), np.array(self.gyro_bias)
+        if temperature is not None and len(temperature):
+            at_c = np.interp(imu.t_ns, temperature.t_ns, temperature.temperature_c)
+            accel_bias = accel_bias + self._by_temperature(self.accel_temperature, at_c)
+            gyro_bias = gyro_bias + self._by_temperature(self.gyro_temperature, at_c)
+        return dataclasses.replace(imu, accel=(imu.accel - accel_bias) @ accel, gyro=(imu.gyro - gyro_bias) @ gyro)
+
+    def _by_temperature(self, coefficients: tuple[float, ...], at_c: Floats) -> Floats:
+        """What temperatures (n,) deg C add to a bias: (n, 3)."""
+        beside = np.clip(at_c, *self.temperature_range_c) - self.temperature_c
+        by_axis = np.reshape(coefficients, (3, -1))
+        return np.asarray(beside[:, None] ** np.arange(1, by_axis.shape[1] + 1) @ by_axis.T)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Device calibration as in calibration.toml; `cameras` by the name that images carry."""
+    """Device calibration as in calibration.toml; `cameras` by the name that images carry; `pieces` by the kind of
+    calibration that found them."""
 
     device: str = "unknown"
     device_class: str = "mems"
@@ -237,6 +264,7 @@ class Calibration:
     magnetometer_noise: MagnetometerNoise = field(default_factory=MagnetometerNoise)
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    pieces: Mapping[str, Piece] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         noises = (getattr(self, f.name) for f in dataclasses.fields(self) if f.name.endswith("_noise"))
@@ -258,6 +286,8 @@ _converter = cattrs.Converter(forbid_extra_keys=True)
 def calibration_from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
     """Calibration of a parsed TOML table; missing tables take the class default, unknown keys are refused."""
     filled = dict(data)
+    if filled.pop("schema", SCHEMA) not in (1, SCHEMA):
+        raise CalibrationError(where, f"schema = {data['schema']}", f"1 or {SCHEMA}", "calibrate with this version")
     name = filled.get("device_class", "mems")
     if name not in DEVICE_CLASSES:
         raise CalibrationError(where, f"device_class = {name!r}", f"one of {', '.join(DEVICE_CLASSES)}")
@@ -283,4 +313,4 @@ def load_calibration(path: str | Path) -> Calibration:
 
 def calibration_toml(calibration: Calibration) -> str:
     """The text of calibration.toml; `calibration_from_dict` of it gives the same calibration."""
-    return tomli_w.dumps(dataclasses.asdict(calibration))
+    return tomli_w.dumps({"schema": SCHEMA} | dataclasses.asdict(calibration))

@@ -1,0 +1,98 @@
+"""Calibration from recordings: each kind is one module and one row of `KINDS`.
+
+A module has ``fit(sources, options) -> CalibrationResult`` and the dataclass of its options, whose fields are the
+options of ``smartnav calibrate KIND``. What the data do not support is not fitted but refused by name.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from smartnav_graph import readers
+from smartnav_graph.calibrate.result import CalibrationResult
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.core.files import replacing
+from smartnav_graph.core.timebase import NS, utc_from_gps
+from smartnav_graph.session.calibration.model import Calibration, calibration_toml, load_calibration
+from smartnav_graph.session.calibration.pieces import Piece
+from smartnav_graph.session.session import Session
+
+Fit = Callable[[Sequence[Session] | Sequence[Path], object], CalibrationResult]
+
+
+@dataclass(frozen=True)
+class CalibrationKind:
+    """A kind of calibration: its module here, its class of options, one line of help, an example of its use.
+
+    paths : it reads files or folders itself (images), no sessions
+    """
+
+    module: str
+    options: str
+    summary: str
+    example: str
+    paths: bool = False
+
+    def options_class(self) -> type:
+        """The dataclass of the options."""
+        found: type = getattr(self._module(), self.options)
+        return found
+
+    def fit(self) -> Fit:
+        """``fit(sources, options)`` of the module."""
+        found: Fit = self._module().fit  # type: ignore[attr-defined]
+        return found
+
+    def _module(self) -> object:
+        return importlib.import_module(f"smartnav_graph.calibrate.{self.module}")
+
+
+KINDS: dict[str, CalibrationKind] = {}
+
+
+def date_of(sessions: Sequence[Session] | Sequence[Path]) -> str:
+    """Date (UTC) of the first recording whose clock is a date, else of today."""
+    for session in sessions:
+        if isinstance(session, Session) and session.clock_epoch in ("unix", "gps"):
+            gps = session.clock_epoch == "gps"
+            unix_ns = int(utc_from_gps(np.array(session.t0_ns))) if gps else session.t0_ns
+            return datetime.fromtimestamp(unix_ns / NS, UTC).date().isoformat()
+    return datetime.now(UTC).date().isoformat()
+
+
+def calibrate_into(
+    out: Path, kind: str, sources: Sequence[str], options: object = None, *, force: bool = False
+) -> tuple[CalibrationResult, Piece]:
+    """Calibrate by recordings, and add what is found to the calibration.toml `out`: the result, and its record.
+
+    Parameters
+    ----------
+    out : the file; other pieces in it stay as they are
+    kind : a name of `KINDS`
+    sources : session folders or logs; files or folders of images where the kind reads those
+    options : of the kind; its defaults by default
+    force : replace a piece of the same kind
+
+    Raises
+    ------
+    CalibrationError
+        The recordings do not support the calibration, or the file has this piece already, or is no calibration.toml.
+    """
+    row, known = KINDS[kind], Calibration()
+    if out.exists():
+        known = load_calibration(out)
+    if kind in known.pieces and not force:
+        found = f"has the piece {kind!r} of {known.pieces[kind].date} already"
+        raise CalibrationError(out, found, "a file without it", "choose another --out, or add --force to replace it")
+    given: list[Session] | list[Path] = [Path(s) for s in sources] if row.paths else [readers.load(s) for s in sources]
+    result = row.fit()(given, row.options_class()() if options is None else options)
+    calibration = result.merged(known, kind, date_of(given), [Path(source).name for source in sources])
+    with replacing(out) as new:
+        new.write_text(calibration_toml(calibration), encoding="utf-8")
+    return result, calibration.pieces[kind]
