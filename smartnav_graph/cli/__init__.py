@@ -1,7 +1,7 @@
 """The command line: sub-commands, no logic.
 
 Exit codes: 0 done, 1 a named error, 2 wrong usage, 3 done and written but the measurements contradict each other, 130
-interrupted.
+interrupted, 143 terminated.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+from smartnav_graph.core import interrupts
 from smartnav_graph.core.errors import SmartnavError
 
 if TYPE_CHECKING:
@@ -96,22 +97,48 @@ def _run(name: str, rest: list[str]) -> int:
     try:
         with _interrupt_ends_process():
             kind = command_class(name)
-        from smartnav_graph.cli.options import parse
-
-        kind, name, rest = kind.narrowed(name, rest)
-        command = parse(kind, name, rest)
-        logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
-        return command.run() or 0
+        return _carry_out(kind, name, rest)
     except SmartnavError as error:
         if "--debug" in rest:
             traceback.print_exc()
         print(f"smartnav: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("smartnav: interrupted; nothing was written", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        return _interrupted(error.number if isinstance(error, interrupts.Interrupted) else signal.SIGINT)
     except SystemExit as exit:  # --help, or wrong arguments
         return exit.code if isinstance(exit.code, int) else 2
+
+
+def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
+    from smartnav_graph.cli.options import parse
+    from smartnav_graph.core.files import remove_unfinished, written
+
+    written.clear()
+    with interrupts.raising() as received:
+        try:
+            kind, name, rest = kind.narrowed(name, rest)
+            command = parse(kind, name, rest)
+            logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
+            return command.run() or 0
+        except (SmartnavError, BrokenPipeError, SystemExit):
+            raise
+        except Exception as error:
+            if not received:
+                raise
+            raise interrupts.Interrupted(received[0]) from error  # compiled code made another exception of it
+        finally:
+            with interrupts.held():
+                remove_unfinished()
+
+
+def _interrupted(number: int) -> int:
+    """Say what was written before the signal came; the exit code."""
+    from smartnav_graph.core.files import written
+
+    there = [str(path) for path in written if path.exists()]
+    found = f"{', '.join(there)} written before" if there else "nothing was written"
+    print(f"smartnav: {'interrupted' if number == signal.SIGINT else 'terminated'}; {found}", file=sys.stderr)
+    return 128 + number
 
 
 @contextmanager

@@ -26,7 +26,7 @@ def progress(quiet: bool) -> Iterator[Progress]:
     Gives a function of stage, done and total (0: unknown; then the elapsed time is shown). Nothing is written where
     stderr is not a terminal.
     """
-    if quiet or not sys.stderr.isatty():
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield silent
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"))

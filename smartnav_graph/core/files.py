@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
+import logging
 import os
 import shutil
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,8 +18,15 @@ import pyarrow.parquet as pq
 
 from smartnav_graph.core.arrays import Column, Table
 from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.core.interrupts import held
 
 ROW_GROUP = 1 << 20
+UNFINISHED = ".writing"  # ending of the temporary folders
+_REPLACED = "replaced"
+_LOG = logging.getLogger(__name__)
+# What this process has written, and the temporary folders that it holds, with their locks.
+written: list[Path] = []
+_claimed: dict[Path, int] = {}
 
 
 def read_toml(path: Path, fault: type[SmartnavError], what: str) -> dict[str, Any]:
@@ -41,30 +50,30 @@ def refuse_existing(path: Path, force: bool) -> None:
 def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; move it into place only when the block ends well.
 
-    Works for files and for folders (create the one wanted at the yielded path). On any failure, an interrupt or a
-    full disk included, the temporary is removed and `path` is left as it was.
+    Works for files and for folders (create the one wanted at the yielded path). At any failure, interrupt or end of
+    the process `path` holds the old or the new, whole. The temporary folder ``.NAME.writing`` stays only where the
+    process is killed; the next that writes there says so and removes it.
 
     Raises
     ------
     SessionError
-        `path` exists and `force` is not given, or the system refuses to write.
+        `path` exists and `force` is not given, another process is writing there, or the system refuses to write.
     """
-    path = Path(path)
+    path = Path(os.path.abspath(path))
     refuse_existing(path, force)
+    scratch = path.parent / f".{path.name}{UNFINISHED}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        with held():
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _claim(scratch, path)
+            except OSError as error:
+                raise SessionError(path, f"cannot be written ({error.strerror})", "a writable place") from error
+        yield scratch / path.name
+        with held():
+            _put(scratch / path.name, path, scratch / _REPLACED)
+            written.append(path)
     except OSError as error:
-        raise SessionError(path, f"cannot be written ({error.strerror})", "a writable place") from error
-    new = scratch / path.name
-    try:
-        yield new
-        if path.is_dir():
-            os.replace(path, scratch / "replaced")
-        os.replace(new, path)
-    except OSError as error:
-        if (scratch / "replaced").exists() and not path.exists():
-            os.replace(scratch / "replaced", path)
         raise SessionError(
             path,
             f"could not be written ({error.strerror or error})",
@@ -72,7 +81,73 @@ def replacing(path: str | Path, *, force: bool = True) -> Iterator[Path]:
             "nothing was changed; free some space or choose another place",
         ) from error
     finally:
+        with held():
+            _release(scratch)
+
+
+def remove_unfinished() -> None:
+    """Remove what this process has begun to write and will not end."""
+    for scratch in list(_claimed):
+        _release(scratch)
+
+
+def _claim(scratch: Path, path: Path) -> None:
+    """Make the temporary folder and lock it; what a killed process left there is named, put back or removed."""
+    while True:
+        scratch.mkdir(exist_ok=True)
+        lock = os.open(scratch, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(lock)
+            found = "is being written by another process"
+            raise SessionError(path, found, "one at a time", "wait for it, or choose another --out") from error
+        if scratch.is_dir() and os.path.samestat(os.fstat(lock), os.stat(scratch)):
+            break
+        os.close(lock)  # the other process has ended and removed its folder since
+    _claimed[scratch] = lock
+    if (scratch / _REPLACED).exists() and not os.path.lexists(path):
+        os.replace(scratch / _REPLACED, path)
+    for old in scratch.iterdir():
+        _LOG.warning("%s: left by a process that was killed; removed", old)
+        _remove(old)
+    for other in path.parent.glob(f".*{UNFINISHED}"):
+        if other not in _claimed:
+            _LOG.warning("%s: of a process that is writing, or was killed; in the latter case remove it", other)
+
+
+def _release(scratch: Path) -> None:
+    lock = _claimed.pop(scratch, None)
+    if lock is not None:
         shutil.rmtree(scratch, ignore_errors=True)
+        os.close(lock)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink()
+
+
+def _put(new: Path, path: Path, aside: Path) -> None:
+    """Move `new` to `path` in one step where the system can; what was at `path` is left beside `new`."""
+    if not os.path.lexists(path) or not (new.is_dir() or path.is_dir()):
+        os.replace(new, path)
+    elif not _exchange(new, path):  # two steps: a kill between them leaves the old in `aside`
+        os.replace(path, aside)
+        try:
+            os.replace(new, path)
+        except OSError:
+            os.replace(aside, path)
+            raise
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchange two paths in one step (renameat2 of Linux); whether the system and the disk can."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    at_cwd, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return rename is not None and rename(at_cwd, os.fsencode(first), at_cwd, os.fsencode(second), exchange) == 0
 
 
 def refuse_foreign(path: str | Path, mark: str) -> None:

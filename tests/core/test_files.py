@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 
 import pytest
 
@@ -86,10 +87,74 @@ def test_a_move_that_fails_puts_the_old_back(target, monkeypatch):
             raise OSError(errno.EIO, "Input/output error")
         real(source, destination)
 
+    monkeypatch.setattr(files, "_exchange", lambda first, second: False)  # a disk that cannot
     monkeypatch.setattr(files.os, "replace", replace)
     with pytest.raises(SessionError, match=r"could not be written \(Input/output error\)"), replacing(path) as new:
         write(new, kind, "new")
     assert moved and read(path) == "old" and names(path.parent) == ["result"]
+
+
+def test_a_disk_that_cannot_exchange(target, monkeypatch):
+    path, kind = target
+    monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    with replacing(path) as new:
+        write(new, kind, "new")
+    assert read(path) == "new" and names(path.parent) == ["result"]
+
+
+def test_a_second_writer_is_refused(target):
+    path, kind = target
+    with replacing(path) as new:
+        write(new, kind, "new")
+        held = files._claimed.pop(new.parent)  # as another process sees it
+        with pytest.raises(SessionError, match="result: is being written by another process"), replacing(path):
+            pytest.fail("the block must not run")
+        files._claimed[new.parent] = held
+    assert read(path) == "new" and names(path.parent) == ["result"]
+
+
+def test_what_a_killed_process_left_is_named_and_removed(target, caplog):
+    path, kind = target
+    scratch = path.parent / ".result.writing"
+    scratch.mkdir()
+    write(scratch / "result", kind, "half")
+    with replacing(path) as new:
+        write(new, kind, "new")
+    assert caplog.messages == [f"{scratch / 'result'}: left by a process that was killed; removed"]
+    assert read(path) == "new" and names(path.parent) == ["result"]
+
+
+def test_the_old_is_put_back_where_a_kill_came_between_two_moves(target, caplog):
+    path, kind = target
+    scratch = path.parent / ".result.writing"
+    scratch.mkdir()
+    os.replace(path, scratch / "replaced")
+    with pytest.raises(KeyboardInterrupt):
+        break_off(path, kind, KeyboardInterrupt())
+    assert read(path) == "old" and names(path.parent) == ["result"]
+
+
+def test_another_unfinished_folder_is_named_and_stays(target, caplog):
+    path, kind = target
+    (path.parent / ".other.writing").mkdir()
+    with replacing(path) as new:
+        write(new, kind, "new")
+    assert ".other.writing: of a process that is writing, or was killed" in caplog.text
+    assert names(path.parent) == [".other.writing", "result"]
+
+
+def test_a_signal_waits_until_the_new_is_in_its_place(target, monkeypatch):
+    path, kind = target
+    moved = files._put
+
+    def put(new, path, aside):
+        signal.raise_signal(signal.SIGINT)
+        moved(new, path, aside)
+
+    monkeypatch.setattr(files, "_put", put)
+    with pytest.raises(KeyboardInterrupt), replacing(path) as new:
+        write(new, kind, "new")
+    assert read(path) == "new" and names(path.parent) == ["result"]
 
 
 def test_nothing_is_replaced_without_leave(target):
