@@ -63,7 +63,8 @@ MODEL = AtKeyframe(Level())
 class StandstillBuilder(Builder):
     """Adds the factors of a standstill at each keyframe inside one.
 
-    rests : the standstills of the recording; _floor : the floor's state, once a stance has been seen
+    rests : the standstills of the recording; _floor : the floor's state, once a stance has been seen; _stance : stamp
+    of the last one whose level is in the graph
     """
 
     rests: Standstills
@@ -72,10 +73,11 @@ class StandstillBuilder(Builder):
     stage: int = 0
     lookahead_s: float = LOOKAHEAD_S
     _floor: SessionState | None = None
+    _stance: int | None = None
     _sigmas: PerWindow[tuple[float, float]] = field(default_factory=PerWindow)
 
     def begin(self) -> StandstillBuilder:
-        return replace(self, _floor=None)
+        return replace(self, _floor=None, _stance=None)
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Factors at the keyframe that ends `window`."""
@@ -112,6 +114,11 @@ class StandstillBuilder(Builder):
         return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     def _add_level(self, update: GraphUpdate) -> None:
+        """Once a stance: at all of its keyframes the floor is as far from its level."""
+        stance = self.rests.start_of(update.t_ns)
+        if stance == self._stance:
+            return
+        self._stance = stance
         if self._floor is None:
             height = np.array([update.predicted.position()[2]])
             self._floor = SessionState("U", self.name, "floor_height_m", height, np.array([UNKNOWN_LEVEL]))

@@ -125,11 +125,14 @@ def test_a_false_stance_pulls_with_constant_force_only():
 
 
 def test_all_stances_of_a_foot_are_on_one_floor():
-    builder = StandstillBuilder(rests(on_foot=True), StandstillConfig(flat_floor=True))
+    two = rests(on_foot=True)
+    two.speed_sigma[(T_NS > 1.7 * NS) & (T_NS < 2.0 * NS)] = np.nan  # in the air
+    builder = StandstillBuilder(two, StandstillConfig(flat_floor=True))
     first, second = step_of(builder, 1.0, 1.5, height=2.0), step_of(builder, 1.5, 2.0, height=2.5, index=2)
     (floor,) = first.session.values()
     assert floor.name == "floor_height_m" and floor.initial.tolist() == [2.0]
     assert second.session == first.session  # one state, one prior
+    assert not step_of(builder, 2.0, 2.5, index=3).blocks  # the same stance: its floor is not measured anew
     (block,) = second.blocks
     residual, _ = block.model.linearize(
         [
