@@ -328,7 +328,7 @@ def refute_standstills(session: Session, notes: Notes) -> Session:
     rests = notes.rests
     if rests is None or not rests.still.any():
         return session
-    spans = [] if notes.pairs is None else moving_spans(notes.pairs).tolist()
+    spans = [] if notes.pairs is None else moving_spans(notes.pairs, rests.rests()).tolist()
     available_ns = notes.span[0] + round(INITIALISATION_S * NS) if notes.causal else None
     images = [Moving("images", *span) for span in spans]
     moving = find_moving(session, rests, notes.calibration.gnss_noise, images, available_ns)

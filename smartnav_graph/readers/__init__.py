@@ -78,7 +78,8 @@ def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
         It is neither, or a file in it is missing, unreadable or faulty.
     """
     folder = Path(source)
-    ours = (folder / "session.toml").is_file() and not any(folder.glob("*.csv"))
+    ours = (folder / "session.toml").is_file()
+    ours &= (folder / "imu.parquet").is_file() or not any(folder.glob("*.csv"))  # a csv folder may have one, too
     return session_folder.load(folder, repairs=repairs) if ours else read(source, repairs=repairs)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +19,9 @@ MOST_DISPLACEMENT, LEAST_S, MOST_S, MATCHES = 1e-3, 0.5, 2.0, 8
 SPEED_SIGMA = 0.01
 SOURCE = "images"
 # Displacement of nearly all points, in units of the one above, of a camera that moves though it does not turn; the
-# share of the points; time (s) before the second image that the motion surely holds for.
-MOVING, NEARLY_ALL, RECENT_S = 5.0, 80.0, 1.0
+# share of the points; time (s) before the second image that a standstill is refuted for, and of a standstill that is
+# uncertain at both ends (ns).
+MOVING, NEARLY_ALL, RECENT_S, EDGE_NS = 5.0, 80.0, 1.0, NS // 10
 
 
 def static_periods(pairs: Pairs) -> StaticPeriod | None:
@@ -32,11 +35,15 @@ def static_periods(pairs: Pairs) -> StaticPeriod | None:
     return StaticPeriod(t_ns=start, t_end_ns=end, sigma_v=np.full(len(start), SPEED_SIGMA), source=source)
 
 
-def moving_spans(pairs: Pairs) -> NDArray[np.int64]:
-    """Spans (k, 2) ns in which images of a camera that does not turn show motion."""
+def moving_spans(pairs: Pairs, rests: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+    """Spans (k, 2) ns in which images of a camera that does not turn show motion, though both were taken in one of the
+    `rests`, spans of stamps: between an image before a rest and one in it, the motion may have ended."""
     usable, most = _displacement(pairs, 100.0 - NEARLY_ALL)
-    spans = pairs.t_ns[pairs.images[usable][most > MOVING * MOST_DISPLACEMENT]].reshape(-1, 2)
-    spans[:, 0] = np.maximum(spans[:, 0], spans[:, 1] - round(RECENT_S * NS))
+    first, last = pairs.t_ns[pairs.images[usable][most > MOVING * MOST_DISPLACEMENT]].reshape(-1, 2).T
+    start, end = np.array(rests, dtype=np.int64).reshape(-1, 2).T
+    rest = np.searchsorted(start, first - EDGE_NS, side="right") - 1
+    inside = (rest >= 0) & (last + EDGE_NS <= end[rest]) if len(rests) else np.zeros(len(first), dtype=bool)
+    spans = np.stack([np.maximum(first, last - round(RECENT_S * NS)), last], axis=1)[inside]
     return np.stack(_union(spans), axis=1) if len(spans) else spans
 
 

@@ -53,7 +53,8 @@ def test_every_stream_survives_the_way_through_csv_exactly(tmp_path):
     (tmp_path / "session.toml").write_text((tmp_path / "saved" / "session.toml").read_text())
 
     assert readers.find(tmp_path).name == "csv"
-    again, saved = readers.read(tmp_path), load(tmp_path / "saved")
+    (tmp_path / "saved" / "notes.csv").write_text("another table\n")  # beside a session: not looked at
+    again, saved = readers.read(tmp_path), readers.load(tmp_path / "saved")
     assert (again.device, again.origin, again.clock_epoch) == (original.device, original.origin, "gps")
     for other in (again, saved):
         assert set(other.streams()) == set(STREAMS)

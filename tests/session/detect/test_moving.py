@@ -121,4 +121,7 @@ def test_images_show_motion_where_nearly_all_points_move(share, moves):
     x0 = rng.uniform(-0.5, 0.5, (50, 2))
     x1 = x0 + np.where(np.arange(50)[:, None] < share * 50, [0.02, 0.0], 0.0)
     pairs = Pairs(np.array([0, NS]), np.array([[0, 1]]), x0, x1, np.zeros(50, dtype=np.intp))
-    assert moving_spans(pairs).tolist() == ([[0, NS]] if moves else [])
+    rest = [(-NS, 2 * NS)]
+    assert moving_spans(pairs, rest).tolist() == ([[0, NS]] if moves else [])
+    begun = [(NS // 2, 2 * NS)]  # the first image was taken before the standstill
+    assert not len(moving_spans(pairs, begun)) and not len(moving_spans(pairs, []))
