@@ -9,7 +9,7 @@ import tomli_w
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import Origin
-from smartnav_graph.session.folder import load, save
+from smartnav_graph.session.folder import save
 from smartnav_graph.session.session import Device, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS, ControlPoint, GnssFix, Imu, Reference
