@@ -1,0 +1,365 @@
+"""Interior orientation of a camera from pictures of a flat board, with covariance.
+
+    pixel = project(theta, R_v X + t_v) + noise,    theta = fx, fy, cx, cy, distortion
+
+Least squares over theta and the pose of every view v; the poses are eliminated, which leaves for theta
+
+    S = sum_v S_v,  S_v = A_v' A_v - A_v' B_v (B_v' B_v)^-1 B_v' A_v,   cov(theta) = s^2 S^-1
+
+A_v, B_v : derivatives of the pixels of a view by theta and by its pose; s^2 : sum of squared residuals over degrees of
+freedom. Errors within a view are not independent (blur, a board that is not flat, a model that does not fit): the
+covariance is raised to what the scatter of the sums A' r between views shows, each corrected for its leverage. With few
+views that is known on average only: f, its mean over all directions, is blended with the scatter of each.
+
+Source: Zhang (2000), A flexible new technique for camera calibration; Bell, McCaffrey (2002), Bias reduction in standard
+errors for linear regression with multi-stage samples (the correction for leverage).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.core.so3 import exp
+from smartnav_graph.session.calibration.camera import Camera
+
+# Models of a camera and their distortion coefficients.
+MODELS = {
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+PINHOLE = ("fx", "fy", "cx", "cy")
+WHERE = "calibrate camera"
+LEAST_VIEWS = 4
+LEAST_TILT_DEG = 8.0  # largest angle between the normals of two views
+ALIKE_DEG, ALIKE_SHARE = 1.0, 0.02  # views that differ by less in turn, and in position over the distance, are one
+OUTLIER = 3.0  # root mean square of a view over the median of all
+LARGEST_FOCAL_SIGMA = 0.05  # over the focal length
+_ITERATIONS, _CONVERGED = 60, 1e-10
+_NONLINEAR = 3.0  # largest factor by which the sum of squares departs from a parabola at two sigmas
+_SINGULAR = 1e-13  # least eigenvalue of S with unit diagonal
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture of the board: name, points of the board (n, 3) m, pixels (n, 2)."""
+
+    name: str
+    points: Floats
+    xy: Floats
+
+
+class Normal(NamedTuple):
+    """One linearisation: residuals of each view (n, 2), derivatives by theta (2 n, p) reduced by the pose of the view,
+    S (p, p), right side (p,), and what the steps of the poses need."""
+
+    residuals: list[Floats]
+    reduced: list[Floats]
+    S: Floats
+    g: Floats
+    poses: list[tuple[Floats, Floats, Floats]]  # B' B, B' A, B' r
+
+    @property
+    def cost(self) -> float:
+        return float(sum((r**2).sum() for r in self.residuals))
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """A calibration.
+
+    model : one of `MODELS`; theta (p,), covariance (p, p) by `names`; poses (v, 6) : rotation vector and position of
+    the board in camera axes, m; views, residuals : observed less projected, px, of each view
+    noise_px : of one coordinate of a corner; inflation : f above, 1 for independent errors; left_out : name of a view, reason
+    """
+
+    model: str
+    width: int
+    height: int
+    theta: Floats
+    covariance: Floats
+    poses: Floats
+    views: tuple[View, ...]
+    residuals: tuple[Floats, ...]
+    noise_px: float
+    inflation: float
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return (*PINHOLE, *MODELS[self.model])
+
+    @property
+    def sigmas(self) -> Floats:
+        """Of the parameters (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the distances between observed and projected corners, as OpenCV gives it."""
+        squares = np.concatenate([(r**2).sum(axis=1) for r in self.residuals])
+        return float(np.sqrt(squares.mean()))
+
+    @property
+    def view_rms_px(self) -> Floats:
+        """The same of each view (v,)."""
+        return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
+
+    @property
+    def camera(self) -> Camera:
+        """As calibration.toml holds it."""
+        fx, fy, cx, cy, *distortion = map(float, self.theta)
+        model = "fisheye" if self.model == "fisheye" else "brown"
+        return Camera(self.width, self.height, fx, fy, cx, cy, model, tuple(distortion))
+
+
+def project(model: str, theta: Floats, pose: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Pixels (n, 2) of points (n, 3), and their derivatives by theta (2 n, p) and by rotation vector and
+    position (2 n, 6) of the board."""
+    import cv2
+
+    K = np.array([[theta[0], 0.0, theta[2]], [0.0, theta[1], theta[3]], [0.0, 0.0, 1.0]])
+    distortion = np.ascontiguousarray(theta[4:])
+    if model == "fisheye":
+        xy, J = cv2.fisheye.projectPoints(points[:, None], pose[:3], pose[3:], K, distortion)
+        return xy.reshape(-1, 2), J[:, :8], J[:, 8:14]
+    xy, J = cv2.projectPoints(points, pose[:3], pose[3:], K, distortion)
+    return xy.reshape(-1, 2), J[:, 6 : 6 + len(theta)], J[:, :6]
+
+
+def pose_of(found: CameraFit, view: View) -> Floats:
+    """Rotation vector and position (6,) of the board in a view, by the calibration."""
+    import cv2
+
+    xy = np.ascontiguousarray(found.camera.normalised(view.xy))
+    _, turn, place = cv2.solvePnP(view.points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    turn, place = cv2.solvePnPRefineLM(view.points, xy, np.eye(3), None, turn, place)
+    return np.concatenate([turn.ravel(), place.ravel()])
+
+
+def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[View]) -> Normal:
+    """Residuals and normal matrix of theta."""
+    p = len(theta)
+    S, g = np.zeros((p, p)), np.zeros(p)
+    residuals, reduced, kept = [], [], []
+    for view, pose in zip(views, poses, strict=True):
+        xy, A, B = project(model, theta, pose, view.points)
+        r = view.xy - xy
+        BB, BA, Br = B.T @ B, B.T @ A, B.T @ r.ravel()
+        A_v = A - B @ np.linalg.solve(BB, BA)
+        S += A_v.T @ A_v
+        g += A_v.T @ r.ravel()
+        residuals.append(r)
+        reduced.append(A_v)
+        kept.append((BB, BA, Br))
+    return Normal(residuals, reduced, S, g, kept)
+
+
+def minimise(model: str, theta: Floats, poses: Floats, views: Sequence[View]) -> tuple[Floats, Floats, Normal]:
+    """Levenberg-Marquardt over theta and the poses; where it does not converge, S is nearly singular."""
+    now, damping = linearise(model, theta, poses, views), 1e-6
+    for _ in range(_ITERATIONS):
+        step = np.linalg.solve(now.S + damping * np.diag(np.diag(now.S)), now.g)
+        moves = [np.linalg.solve(BB, Br - BA @ step) for BB, BA, Br in now.poses]
+        tried = linearise(model, theta + step, poses + np.array(moves), views)
+        if tried.cost <= now.cost:
+            small = now.cost - tried.cost <= _CONVERGED * now.cost
+            theta, poses, now, damping = theta + step, poses + np.array(moves), tried, max(damping / 10, 1e-12)
+            if small:
+                return theta, poses, now
+        elif damping > 1e8:
+            break
+        else:
+            damping *= 10
+    return theta, poses, now
+
+
+def scatter_of_views(normal: Normal, variance: float) -> Floats:
+    """Covariance (p, p) of theta by the scatter of the sums A' r of views, from that of independent errors up."""
+    inverse = np.linalg.inv(normal.S)
+    L = np.linalg.cholesky(0.5 * (inverse + inverse.T))
+    M, p, count = np.zeros_like(L), len(L), len(normal.residuals)
+    for A_v, r in zip(normal.reduced, normal.residuals, strict=True):
+        share, axes = np.linalg.eigh(L.T @ A_v.T @ A_v @ L)
+        u = axes @ ((axes.T @ (L.T @ A_v.T @ r.ravel())) / np.sqrt(np.maximum(1.0 - share, 0.05)))
+        M += np.outer(u, u) / variance
+    f = max(1.0, np.trace(M) / p)
+    own = (1.0 - 1.0 / f) * count / (count + p)
+    values, axes = np.linalg.eigh((1.0 - own) * f * np.eye(p) + own * M)
+    return np.asarray(variance * L @ (axes * np.maximum(values, 1.0)) @ axes.T @ L.T)
+
+
+def _fit(model: str, size: tuple[int, int], views: Sequence[View], theta: Floats, poses: Floats) -> CameraFit:
+    theta, poses, normal = minimise(model, theta, poses, views)
+    names = (*PINHOLE, *MODELS[model])
+    scale = np.sqrt(np.diag(normal.S))
+    values, axes = np.linalg.eigh(normal.S / np.outer(scale, scale))
+    if not values[0] > _SINGULAR:
+        worst = names[int(np.argmax(np.abs(axes[:, 0])))]
+        remedy = "take a model with fewer terms, or views with the board near the edges of the picture"
+        raise CalibrationError(WHERE, f"{worst} of model {model} is not determined", "views that determine it", remedy)
+    freedom = sum(r.size for r in normal.residuals) - len(theta) - 6 * len(views)
+    variance = normal.cost / freedom
+    step = axes[:, 0] / scale / np.sqrt(values[0] / variance)  # one sigma in the direction that is known least
+    if not _is_linear(model, theta, poses, views, normal, step, variance):
+        worst = names[int(np.argmax(np.abs(axes[:, 0])))]
+        found = f"{worst} of model {model} has no finite interval: other terms can replace it"
+        remedy = "take a model with fewer terms, or views with the board near the edges of the picture"
+        raise CalibrationError(WHERE, found, "views that determine it", remedy)
+    covariance = scatter_of_views(normal, variance)
+    f = float(np.trace(covariance @ normal.S)) / (variance * len(theta))
+    residuals = tuple(normal.residuals)
+    return CameraFit(model, *size, theta, covariance, poses, tuple(views), residuals, float(np.sqrt(variance)), f)
+
+
+def _is_linear(
+    model: str, theta: Floats, poses: Floats, views: Sequence[View], best: Normal, step: Floats, variance: float
+) -> bool:
+    """Whether two sigmas along `step` raise the sum of squares by four variances, within a factor."""
+    for sign in (-2.0, 2.0):
+        moved = theta + sign * step
+        there = poses + np.array([-np.linalg.solve(BB, BA @ (sign * step)) for BB, BA, _ in best.poses])
+        for _ in range(3):
+            now = linearise(model, moved, there, views)
+            there = there + np.array([np.linalg.solve(BB, Br) for BB, _, Br in now.poses])
+        rise = (linearise(model, moved, there, views).cost - best.cost) / (4.0 * variance)
+        if not 1.0 / _NONLINEAR < rise < _NONLINEAR:
+            return False
+    return True
+
+
+def calibrate_camera(
+    views: Sequence[View], size: tuple[int, int], model: str = "brown", *, keep: bool = False
+) -> CameraFit:
+    """The camera that took these views, of pictures of `size` (width, height) px.
+
+    A view is left out where its residuals exceed `OUTLIER` times the median of all views, one after the other, unless
+    all are to be kept.
+
+    Raises
+    ------
+    CalibrationError
+        Too few or alike views, one orientation of the board only, or a term that the views do not determine.
+    """
+    check_count(views)
+    theta, poses = _start(model, size, views)
+    check_orientations(views, poses)
+    left_out: list[tuple[str, str]] = []
+    while True:
+        found = _fit(model, size, views, theta, poses)
+        rms = found.view_rms_px
+        worst, usual = int(np.argmax(rms)), float(np.median(rms))
+        if keep or rms[worst] <= OUTLIER * usual or len(views) <= LEAST_VIEWS:
+            break
+        why = f"residuals of {rms[worst]:.2f} px, {rms[worst] / usual:.1f} times the median of all views"
+        left_out.append((views[worst].name, why))
+        views = [view for i, view in enumerate(views) if i != worst]
+        theta, poses = found.theta, np.delete(found.poses, worst, axis=0)
+    check_orientations(views, found.poses)
+    _check_focal(found)
+    return replace(found, left_out=tuple(left_out))
+
+
+def _start(model: str, size: tuple[int, int], views: Sequence[View]) -> tuple[Floats, Floats]:
+    """First theta (p,) and poses (v, 6)."""
+    import cv2
+
+    if model == "fisheye":
+        return _fisheye_start(size, views)
+    points, xy = ([np.ascontiguousarray(part, np.float32) for part in parts] for parts in _parts(views))
+    fixed = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    try:
+        _, K, k, turns, places = cv2.calibrateCamera(points, xy, size, None, None, flags=fixed)
+    except cv2.error as error:
+        found = "OpenCV finds no first values"
+        raise CalibrationError(WHERE, found, "a flat board in every view", "check --board") from error
+    theta = np.zeros(len(PINHOLE) + len(MODELS[model]))
+    theta[:6] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k.ravel()[:2]
+    return theta, np.hstack([np.reshape(turns, (-1, 3)), np.reshape(places, (-1, 3))])
+
+
+def _parts(views: Sequence[View]) -> tuple[list[Floats], list[Floats]]:
+    return [view.points for view in views], [view.xy for view in views]
+
+
+def _fisheye_start(size: tuple[int, int], views: Sequence[View]) -> tuple[Floats, Floats]:
+    """The best of some focal lengths, from a picture over 250 deg to one over 70 deg of equal angles."""
+    width, height = size
+    best: tuple[Floats, Floats, Normal] | None = None
+    for degrees in (250.0, 180.0, 130.0, 100.0, 70.0):
+        f = max(size) / np.radians(degrees)
+        theta = np.array([f, f, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0])
+        poses = _fisheye_poses(theta, views)
+        if poses is None:
+            continue
+        try:
+            found = minimise("fisheye", theta, poses, views)
+        except (CalibrationError, np.linalg.LinAlgError):
+            continue
+        if np.isfinite(found[2].cost) and (best is None or found[2].cost < best[2].cost):
+            best = found
+    if best is None:
+        raise CalibrationError(WHERE, "no first values for model fisheye", "views of one lens", "try --model rational")
+    return best[0], best[1]
+
+
+def _fisheye_poses(theta: Floats, views: Sequence[View]) -> Floats | None:
+    import cv2
+
+    f, centre, found = theta[0], theta[2:4], []
+    for view in views:
+        from_axis = (view.xy - centre) / f
+        angle = np.linalg.norm(from_axis, axis=1)
+        near = angle < 1.3  # rad: the tangent is that of a picture in front
+        if near.sum() < 8:
+            return None
+        flat = from_axis[near] * (np.tan(angle[near]) / np.maximum(angle[near], 1e-9))[:, None]
+        there, turn, place = cv2.solvePnP(view.points[near], flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        if not there:
+            return None
+        found.append(np.concatenate([turn.ravel(), place.ravel()]))
+    return np.array(found)
+
+
+def check_count(views: Sequence[View]) -> None:
+    """Refuse too few views."""
+    if len(views) < LEAST_VIEWS:
+        remedy = "take 15 to 30 pictures with the board at different places, tilts and distances"
+        raise CalibrationError(WHERE, f"the board in {len(views)} pictures", f"at least {LEAST_VIEWS}", remedy)
+
+
+def check_orientations(views: Sequence[View], poses: Floats) -> None:
+    """Refuse views that are alike, or in which the board has one orientation only."""
+    R = exp(poses[:, :3])
+    distinct: list[int] = []
+    for i in range(len(poses)):
+        turns = Rotation.from_matrix(R[distinct] @ R[i].T).magnitude() if distinct else np.zeros(0)
+        apart = np.linalg.norm(poses[distinct, 3:] - poses[i, 3:], axis=1) / np.linalg.norm(poses[i, 3:])
+        if not ((turns < np.radians(ALIKE_DEG)) & (apart < ALIKE_SHARE)).any():
+            distinct.append(i)
+    if len(distinct) < LEAST_VIEWS:
+        found = f"{len(poses)} views, of which {len(distinct)} differ by {ALIKE_DEG:g} deg or {ALIKE_SHARE:.0%} of the distance"
+        raise CalibrationError(WHERE, found, f"at least {LEAST_VIEWS} that differ", "move and tilt the board between pictures")
+    normals = R[:, :, 2]
+    tilt = float(np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max()))
+    if tilt < LEAST_TILT_DEG:
+        found = f"one orientation of the board: its normals differ by {tilt:.1f} deg at most"
+        remedy = "tilt the board by 20 to 45 deg to all sides; a turn within its plane does not count"
+        raise CalibrationError(WHERE, found, f"at least {LEAST_TILT_DEG:g} deg, else the focal length is open", remedy)
+
+
+def _check_focal(found: CameraFit) -> None:
+    share = float((found.sigmas[:2] / found.theta[:2]).max())
+    if share > LARGEST_FOCAL_SIGMA:
+        remedy = "tilt the board by 20 to 45 deg to all sides, near enough to fill half of the picture"
+        what = f"focal length {found.theta[0]:.0f} +- {found.sigmas[0]:.0f} px"
+        raise CalibrationError(WHERE, what, f"a sigma of at most {LARGEST_FOCAL_SIGMA:.0%}", remedy)
