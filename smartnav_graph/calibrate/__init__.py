@@ -53,7 +53,15 @@ class CalibrationKind:
         return importlib.import_module(f"smartnav_graph.calibrate.{self.module}")
 
 
-KINDS: dict[str, CalibrationKind] = {}
+KINDS: dict[str, CalibrationKind] = {
+    "camera": CalibrationKind(
+        "camera",
+        "CameraOptions",
+        "camera from pictures of a chessboard, asymmetric circles or a ChArUco board",
+        "smartnav calibrate camera pictures/ --board chessboard:9x6:0.025 --out calibration.toml --report camera.html",
+        paths=True,
+    ),
+}
 
 
 def date_of(sessions: Sequence[Session] | Sequence[Path]) -> str:

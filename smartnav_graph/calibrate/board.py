@@ -6,10 +6,11 @@
     charuco:COLUMNSxROWS:SIZE[:MARKER[:DICTIONARY]]     squares, sides of a square and of a marker in m
 
 Corners are found on a picture of at most `SEARCH_PX` and refined at full size, in a window of a third of the least
-distance between corners: a wider one takes in the next corner and moves the found one by pixels.
+distance between corners: a wider one takes in the next corner and moves the found one by pixels. On a ChArUco board it
+ends where the markers begin.
 
-Source: Förstner, Gülch (1987), corners as least-squares intersections of edges (as OpenCV's cornerSubPix); Garrido-Jurado
-et al. (2014), Automatic generation and detection of highly reliable fiducial markers under occlusion.
+Source: Förstner, Gülch (1987), corners as least-squares intersections of edges (as OpenCV's cornerSubPix);
+Garrido-Jurado et al. (2014), Automatic generation and detection of highly reliable fiducial markers under occlusion.
 """
 
 from __future__ import annotations
@@ -150,7 +151,8 @@ def find_corners(gray: Gray, board: Board, window_px: int = 0) -> Corners | None
     if board.kind == "circles":
         full = found if scale == 1.0 else _circles(gray, board)
         return Corners(found.number, xy) if full is None else full
-    return Corners(found.number, refined(gray, xy, window_px))
+    share = min(WINDOW, 0.5 * (1.0 - board.marker_m / board.size_m)) if board.kind == "charuco" else WINDOW
+    return Corners(found.number, refined(gray, xy, window_px, share))
 
 
 def _resized(gray: Gray, scale: float) -> Gray:
@@ -159,13 +161,13 @@ def _resized(gray: Gray, scale: float) -> Gray:
     return np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def refined(gray: Gray, xy: Floats, window_px: int = 0) -> Floats:
-    """Corners (n, 2) px where the edges around them meet."""
+def refined(gray: Gray, xy: Floats, window_px: int = 0, share: float = WINDOW) -> Floats:
+    """Corners (n, 2) px where the edges around them meet, in a window of `share` of their distance."""
     import cv2
 
     if window_px == 0:
         nearest = float(cKDTree(xy).query(xy, 2)[0][:, 1].min())
-        window_px = max(LEAST_WINDOW_PX, math.floor(WINDOW * nearest))
+        window_px = max(LEAST_WINDOW_PX, math.floor(share * nearest))
     steps = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     start = xy.astype(np.float32).reshape(-1, 1, 2)
     found = cv2.cornerSubPix(gray, start, (window_px, window_px), (-1, -1), steps)

@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from smartnav_graph import readers
-from smartnav_graph.calibrate import camera_charts
 from smartnav_graph.calibrate.board import Board, find_corners, size_shown, squares_differ
+from smartnav_graph.calibrate.camera_charts import camera_charts
 from smartnav_graph.calibrate.circles import without_eccentricity
-from smartnav_graph.calibrate.interior import WHERE, CameraFit, View, calibrate_camera, check_count
+from smartnav_graph.calibrate.interior import LEAST_VIEWS, WHERE, BoardView, CameraFit, calibrate_camera, check_count
 from smartnav_graph.calibrate.projection import projection_sigma
 from smartnav_graph.calibrate.result import CalibrationResult
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError, ConfigError
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.calibration.pieces import Residual, Value
@@ -29,6 +31,7 @@ from smartnav_graph.vision.images import BROKEN, Gray, decoded, pictures
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".pgm")
 NOT_FOUND, ALIKE = "board not found", "like the one before it"
 LEAST_MOVE = 0.01  # median displacement of the corners between views over the width of the picture
+MOST_NAMES = 8  # listed
 LOOKED_AT = 5  # pictures in which the size of the board is looked for
 CELLS = (8, 6)  # of the picture, in which corners are counted
 UNCERTAIN_PX = 2.0  # sigma of a projection, px, from which the report warns
@@ -56,7 +59,7 @@ class CameraOptions:
 class Found:
     """Views of the board in pictures of one size, what was left out and why, and warnings."""
 
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     size: tuple[int, int]
     left_out: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
@@ -99,7 +102,9 @@ def _files(sources: Sequence[Path], camera: str) -> list[tuple[str, Path]]:
                 raise CalibrationError(source, f"no pictures of {camera}", f"one of {cameras}", "give --camera")
             found += [(picture.file, picture.path) for picture in mine]
     if not found:
-        raise CalibrationError(WHERE, "no pictures", f"files as {', '.join(SUFFIXES)}", "give files, folders or sessions")
+        raise CalibrationError(
+            WHERE, "no pictures", f"files as {', '.join(SUFFIXES)}", "give files, folders or sessions"
+        )
     return found
 
 
@@ -111,7 +116,7 @@ def find_views(files: Sequence[tuple[str, Path]], board: Board, window_px: int =
     CalibrationError
         Pictures of several sizes; the board in none or in too few of them.
     """
-    views: list[View] = []
+    views: list[BoardView] = []
     left_out: list[tuple[str, str]] = []
     sizes: Counter[tuple[int, int]] = Counter()
     for name, path in files:
@@ -124,7 +129,7 @@ def find_views(files: Sequence[tuple[str, Path]], board: Board, window_px: int =
         if corners is None:
             left_out.append((name, NOT_FOUND))
             continue
-        view = View(name, board.points[corners.number], corners.xy)
+        view = BoardView(name, board.points[corners.number], corners.xy)
         if views and _alike(views[-1], view, gray.shape[1]):
             left_out.append((name, ALIKE))
         else:
@@ -135,9 +140,11 @@ def find_views(files: Sequence[tuple[str, Path]], board: Board, window_px: int =
         raise CalibrationError(WHERE, f"pictures of several sizes: {counted}", "one size", remedy)
     if not sizes:
         raise CalibrationError(WHERE, f"none of {len(files)} pictures can be read", "pictures", "see the files")
-    shown = size_shown((g for _, p in _some(files) if (g := _read(p)) is not None), board)
-    if not views:
-        raise _no_board(len(files), board, shown)
+    shown = None
+    if board.kind == "chessboard" or len(views) < LEAST_VIEWS:  # part of a larger chessboard is found, too
+        shown = size_shown((g for _, p in _some(files) if (g := _read(p)) is not None), board)
+    if not views or (len(views) < LEAST_VIEWS and squares_differ(board, shown)):
+        raise _no_board(len(views), len(files), board, shown)
     check_count(views)
     warnings = [_other_size(board, shown)] if shown is not None and squares_differ(board, shown) else []
     return Found(tuple(views), next(iter(sizes)), tuple(left_out), tuple(warnings))
@@ -154,17 +161,18 @@ def _read(path: Path) -> Gray | None:
         return None
 
 
-def _alike(before: View, now: View, width: int) -> bool:
+def _alike(before: BoardView, now: BoardView, width: int) -> bool:
     if before.points.shape != now.points.shape or not np.array_equal(before.points, now.points):
         return False
     return float(np.median(np.linalg.norm(now.xy - before.xy, axis=1))) < LEAST_MOVE * width
 
 
-def _no_board(count: int, board: Board, shown: tuple[int, int] | None) -> CalibrationError:
+def _no_board(found: int, count: int, board: Board, shown: tuple[int, int] | None) -> CalibrationError:
     remedy = "check kind and counts (inner corners, not squares), light, and that the whole board is in the picture"
     if shown is not None:
         remedy = f"the pictures show {shown[0]} x {shown[1]}: give --board {_with_size(board, shown)}"
-    return CalibrationError(WHERE, f"board {board} in none of {count} pictures", "a picture of the board", remedy)
+    what = f"board {board} in {found or 'none'} of {count} pictures"
+    return CalibrationError(WHERE, what, "pictures of the board", remedy)
 
 
 def _with_size(board: Board, shown: tuple[int, int]) -> Board:
@@ -195,17 +203,28 @@ def _result(found: CameraFit, seen: Found, options: CameraOptions) -> Calibratio
     values[f"{prefix}_variance_inflation"] = Value(found.inflation, np.nan, "1")
     rms = zip(found.views, found.view_rms_px, strict=True)
     residuals = {view.name: Residual(float(r), len(view.xy), "px") for view, r in rms}
-    left_out = dict((*seen.left_out, *found.left_out))
+    left_out = (*seen.left_out, *found.left_out)
     return CalibrationResult(
         values,
         residuals,
-        refused={name: f"picture left out: {why}" for name, why in left_out.items()},
-        warnings=(*seen.warnings, *_warnings(found, sigma.values)),
+        warnings=(*seen.warnings, *_left_out(left_out), *_warnings(found, sigma.values)),
         change=_change(found, options.camera),
-        charts=camera_charts.charts(found, sigma),
+        charts=camera_charts(found, sigma),
         order=order,
         covariance=tuple(found.covariance.ravel().tolist()),
     )
+
+
+def _left_out(pictures: Sequence[tuple[str, str]]) -> list[str]:
+    """One line for each reason."""
+    by_reason: dict[str, list[str]] = {}
+    for name, why in pictures:
+        by_reason.setdefault(why, []).append(name)
+    return [
+        f"Left out, {why}: {', '.join(names[:MOST_NAMES])}"
+        + (f" and {len(names) - MOST_NAMES} more." if len(names) > MOST_NAMES else ".")
+        for why, names in by_reason.items()
+    ]
 
 
 def _change(found: CameraFit, name: str) -> Callable[[Calibration], Calibration]:
@@ -221,14 +240,14 @@ def _change(found: CameraFit, name: str) -> Callable[[Calibration], Calibration]
     return change
 
 
-def coverage(found: CameraFit) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+def coverage(found: CameraFit) -> NDArray[np.intp]:
     """Number of corners (rows, columns) in `CELLS` equal parts of the picture."""
     xy = np.concatenate([view.xy for view in found.views])
     edges = [np.linspace(-0.5, side - 0.5, n + 1) for side, n in zip((found.width, found.height), CELLS, strict=True)]
-    return np.histogram2d(xy[:, 1], xy[:, 0], bins=edges[::-1])[0].astype(np.intp)
+    return np.asarray(np.histogram2d(xy[:, 1], xy[:, 0], bins=edges[::-1])[0], dtype=np.intp)
 
 
-def _warnings(found: CameraFit, sigma: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[str]:
+def _warnings(found: CameraFit, sigma: Floats) -> list[str]:
     texts = []
     empty = float((coverage(found) == 0).mean())
     if empty > 0.25:

@@ -9,7 +9,6 @@ import numpy as np
 from smartnav_graph.calibrate.interior import CameraFit
 from smartnav_graph.calibrate.projection import ImageMap, distortion, projection_difference
 from smartnav_graph.calibrate.result import Chart, Series
-from smartnav_graph.core.arrays import Floats
 from smartnav_graph.session.calibration.camera import Camera
 
 X, Y = "Column [px]", "Row, up from the first [px]"
@@ -19,9 +18,15 @@ LONGEST = 0.05  # drawn length of the longest arrow over the width of the pictur
 FINE = 8  # times finer grid of contours
 
 
-def charts(found: CameraFit, sigma: ImageMap) -> tuple[Chart, ...]:
+def camera_charts(found: CameraFit, sigma: ImageMap) -> tuple[Chart, ...]:
     """All figures."""
-    return (_coverage(found), _residuals(found), _of_views(found), uncertainty(found, sigma), *distorted(found.camera))
+    return (
+        _coverage(found),
+        _residuals(found),
+        _of_views(found),
+        uncertainty_chart(found, sigma),
+        *distortion_charts(found.camera),
+    )
 
 
 def _frame(width: int, height: int) -> Series:
@@ -46,10 +51,10 @@ def _residuals(found: CameraFit) -> Chart:
 def _of_views(found: CameraFit) -> Chart:
     number = np.arange(1.0, len(found.views) + 1)
     dots = Series("root mean square", number, found.view_rms_px, "dots")
-    return Chart("Residuals of views", "View", "Residual [px]", (dots, Series("", number, 0 * number, colour=4)))
+    return Chart("Residuals of views", "BoardView", "Residual [px]", (dots, Series("", number, 0 * number, colour=4)))
 
 
-def uncertainty(found: CameraFit, sigma: ImageMap) -> Chart:
+def uncertainty_chart(found: CameraFit, sigma: ImageMap) -> Chart:
     """Contours of the sigma of a projection."""
     lines = [_frame(found.width, found.height), *_contours(sigma)]
     least, most = np.nanmin(sigma.values), np.nanmax(sigma.values)
@@ -58,7 +63,7 @@ def uncertainty(found: CameraFit, sigma: ImageMap) -> Chart:
     return Chart(title, X, Y, lines, aspect=found.width / found.height, note=note)
 
 
-def differences(one: Camera, other: Camera) -> Chart:
+def difference_chart(one: Camera, other: Camera) -> Chart:
     """Contours of the displacement between two calibrations."""
     xy, apart, _ = projection_difference(one, other)
     x, y = np.unique(xy[:, 0]), np.unique(xy[:, 1])
@@ -90,7 +95,7 @@ def _contours(of: ImageMap) -> Iterator[Series]:
         yield Series(f"{level:g} px", xy[:, 0], -xy[:, 1], colour=colour)
 
 
-def distorted(camera: Camera) -> tuple[Chart, ...]:
+def distortion_charts(camera: Camera) -> tuple[Chart, ...]:
     """Radial and tangential distortion as displacements, enlarged or reduced to a common length."""
     xy, radial, tangential = distortion(camera, (15, 11))
     aspect = camera.width / camera.height

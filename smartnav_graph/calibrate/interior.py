@@ -1,6 +1,6 @@
 """Interior orientation of a camera from pictures of a flat board, with covariance.
 
-    pixel = project(theta, R_v X + t_v) + noise,    theta = fx, fy, cx, cy, distortion
+    pixel = project_board(theta, R_v X + t_v) + noise,    theta = fx, fy, cx, cy, distortion
 
 Least squares over theta and the pose of every view v; the poses are eliminated, which leaves for theta
 
@@ -11,8 +11,8 @@ freedom. Errors within a view are not independent (blur, a board that is not fla
 covariance is raised to what the scatter of the sums A' r between views shows, each corrected for its leverage. With few
 views that is known on average only: f, its mean over all directions, is blended with the scatter of each.
 
-Source: Zhang (2000), A flexible new technique for camera calibration; Bell, McCaffrey (2002), Bias reduction in standard
-errors for linear regression with multi-stage samples (the correction for leverage).
+Source: Zhang (2000), A flexible new technique for camera calibration; Bell, McCaffrey (2002), Bias reduction in
+standard errors for linear regression with multi-stage samples (the correction for leverage).
 """
 
 from __future__ import annotations
@@ -38,18 +38,23 @@ MODELS = {
 }
 PINHOLE = ("fx", "fy", "cx", "cy")
 WHERE = "calibrate camera"
+TILT = (
+    "tilt the board by 20 to 45 deg to all sides, near enough to fill half of the picture; turns within its plane do "
+    "not count"
+)
 LEAST_VIEWS = 4
 LEAST_TILT_DEG = 8.0  # largest angle between the normals of two views
 ALIKE_DEG, ALIKE_SHARE = 1.0, 0.02  # views that differ by less in turn, and in position over the distance, are one
 OUTLIER = 3.0  # root mean square of a view over the median of all
 LARGEST_FOCAL_SIGMA = 0.05  # over the focal length
 _ITERATIONS, _CONVERGED = 60, 1e-10
+_LEAST_PX = 1e-4  # noise of a corner, however exact
 _NONLINEAR = 3.0  # largest factor by which the sum of squares departs from a parabola at two sigmas
 _SINGULAR = 1e-13  # least eigenvalue of S with unit diagonal
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """One picture of the board: name, points of the board (n, 3) m, pixels (n, 2)."""
 
     name: str
@@ -78,7 +83,8 @@ class CameraFit:
 
     model : one of `MODELS`; theta (p,), covariance (p, p) by `names`; poses (v, 6) : rotation vector and position of
     the board in camera axes, m; views, residuals : observed less projected, px, of each view
-    noise_px : of one coordinate of a corner; inflation : f above, 1 for independent errors; left_out : name of a view, reason
+    noise_px : of one coordinate of a corner; inflation : f above, 1 for independent errors
+    left_out : name of a view, reason
     """
 
     model: str
@@ -87,7 +93,7 @@ class CameraFit:
     theta: Floats
     covariance: Floats
     poses: Floats
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     residuals: tuple[Floats, ...]
     noise_px: float
     inflation: float
@@ -122,7 +128,7 @@ class CameraFit:
         return Camera(self.width, self.height, fx, fy, cx, cy, model, tuple(distortion))
 
 
-def project(model: str, theta: Floats, pose: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
+def project_board(model: str, theta: Floats, pose: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
     """Pixels (n, 2) of points (n, 3), and their derivatives by theta (2 n, p) and by rotation vector and
     position (2 n, 6) of the board."""
     import cv2
@@ -136,7 +142,7 @@ def project(model: str, theta: Floats, pose: Floats, points: Floats) -> tuple[Fl
     return xy.reshape(-1, 2), J[:, 6 : 6 + len(theta)], J[:, :6]
 
 
-def pose_of(found: CameraFit, view: View) -> Floats:
+def pose_of(found: CameraFit, view: BoardView) -> Floats:
     """Rotation vector and position (6,) of the board in a view, by the calibration."""
     import cv2
 
@@ -146,13 +152,13 @@ def pose_of(found: CameraFit, view: View) -> Floats:
     return np.concatenate([turn.ravel(), place.ravel()])
 
 
-def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[View]) -> Normal:
+def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[BoardView]) -> Normal:
     """Residuals and normal matrix of theta."""
     p = len(theta)
     S, g = np.zeros((p, p)), np.zeros(p)
     residuals, reduced, kept = [], [], []
     for view, pose in zip(views, poses, strict=True):
-        xy, A, B = project(model, theta, pose, view.points)
+        xy, A, B = project_board(model, theta, pose, view.points)
         r = view.xy - xy
         BB, BA, Br = B.T @ B, B.T @ A, B.T @ r.ravel()
         A_v = A - B @ np.linalg.solve(BB, BA)
@@ -164,7 +170,9 @@ def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[View]) -
     return Normal(residuals, reduced, S, g, kept)
 
 
-def minimise(model: str, theta: Floats, poses: Floats, views: Sequence[View]) -> tuple[Floats, Floats, Normal]:
+def minimise_views(
+    model: str, theta: Floats, poses: Floats, views: Sequence[BoardView]
+) -> tuple[Floats, Floats, Normal]:
     """Levenberg-Marquardt over theta and the poses; where it does not converge, S is nearly singular."""
     now, damping = linearise(model, theta, poses, views), 1e-6
     for _ in range(_ITERATIONS):
@@ -198,31 +206,38 @@ def scatter_of_views(normal: Normal, variance: float) -> Floats:
     return np.asarray(variance * L @ (axes * np.maximum(values, 1.0)) @ axes.T @ L.T)
 
 
-def _fit(model: str, size: tuple[int, int], views: Sequence[View], theta: Floats, poses: Floats) -> CameraFit:
-    theta, poses, normal = minimise(model, theta, poses, views)
+def _fit(model: str, size: tuple[int, int], views: Sequence[BoardView], theta: Floats, poses: Floats) -> CameraFit:
+    theta, poses, normal = minimise_views(model, theta, poses, views)
     names = (*PINHOLE, *MODELS[model])
     scale = np.sqrt(np.diag(normal.S))
     values, axes = np.linalg.eigh(normal.S / np.outer(scale, scale))
+    worst = names[int(np.argmax(np.abs(axes[:, 0])))]
+    check_orientations(views, poses)
     if not values[0] > _SINGULAR:
-        worst = names[int(np.argmax(np.abs(axes[:, 0])))]
-        remedy = "take a model with fewer terms, or views with the board near the edges of the picture"
-        raise CalibrationError(WHERE, f"{worst} of model {model} is not determined", "views that determine it", remedy)
+        raise _open_term(model, worst)
     freedom = sum(r.size for r in normal.residuals) - len(theta) - 6 * len(views)
     variance = normal.cost / freedom
+    variance = max(variance, _LEAST_PX**2)
     step = axes[:, 0] / scale / np.sqrt(values[0] / variance)  # one sigma in the direction that is known least
     if not _is_linear(model, theta, poses, views, normal, step, variance):
-        worst = names[int(np.argmax(np.abs(axes[:, 0])))]
-        found = f"{worst} of model {model} has no finite interval: other terms can replace it"
-        remedy = "take a model with fewer terms, or views with the board near the edges of the picture"
-        raise CalibrationError(WHERE, found, "views that determine it", remedy)
+        raise _open_term(model, worst)
     covariance = scatter_of_views(normal, variance)
     f = float(np.trace(covariance @ normal.S)) / (variance * len(theta))
     residuals = tuple(normal.residuals)
     return CameraFit(model, *size, theta, covariance, poses, tuple(views), residuals, float(np.sqrt(variance)), f)
 
 
+def _open_term(model: str, name: str) -> CalibrationError:
+    if name in PINHOLE:
+        remedy = TILT
+    else:
+        remedy = "take a model with fewer terms, or views with the board near the edges of the picture"
+    found = f"{name} of model {model} has no finite interval: other terms can replace it"
+    return CalibrationError(WHERE, found, "views that determine it", remedy)
+
+
 def _is_linear(
-    model: str, theta: Floats, poses: Floats, views: Sequence[View], best: Normal, step: Floats, variance: float
+    model: str, theta: Floats, poses: Floats, views: Sequence[BoardView], best: Normal, step: Floats, variance: float
 ) -> bool:
     """Whether two sigmas along `step` raise the sum of squares by four variances, within a factor."""
     for sign in (-2.0, 2.0):
@@ -238,7 +253,7 @@ def _is_linear(
 
 
 def calibrate_camera(
-    views: Sequence[View], size: tuple[int, int], model: str = "brown", *, keep: bool = False
+    views: Sequence[BoardView], size: tuple[int, int], model: str = "brown", *, keep: bool = False
 ) -> CameraFit:
     """The camera that took these views, of pictures of `size` (width, height) px.
 
@@ -252,7 +267,6 @@ def calibrate_camera(
     """
     check_count(views)
     theta, poses = _start(model, size, views)
-    check_orientations(views, poses)
     left_out: list[tuple[str, str]] = []
     while True:
         found = _fit(model, size, views, theta, poses)
@@ -264,12 +278,11 @@ def calibrate_camera(
         left_out.append((views[worst].name, why))
         views = [view for i, view in enumerate(views) if i != worst]
         theta, poses = found.theta, np.delete(found.poses, worst, axis=0)
-    check_orientations(views, found.poses)
     _check_focal(found)
     return replace(found, left_out=tuple(left_out))
 
 
-def _start(model: str, size: tuple[int, int], views: Sequence[View]) -> tuple[Floats, Floats]:
+def _start(model: str, size: tuple[int, int], views: Sequence[BoardView]) -> tuple[Floats, Floats]:
     """First theta (p,) and poses (v, 6)."""
     import cv2
 
@@ -287,11 +300,11 @@ def _start(model: str, size: tuple[int, int], views: Sequence[View]) -> tuple[Fl
     return theta, np.hstack([np.reshape(turns, (-1, 3)), np.reshape(places, (-1, 3))])
 
 
-def _parts(views: Sequence[View]) -> tuple[list[Floats], list[Floats]]:
+def _parts(views: Sequence[BoardView]) -> tuple[list[Floats], list[Floats]]:
     return [view.points for view in views], [view.xy for view in views]
 
 
-def _fisheye_start(size: tuple[int, int], views: Sequence[View]) -> tuple[Floats, Floats]:
+def _fisheye_start(size: tuple[int, int], views: Sequence[BoardView]) -> tuple[Floats, Floats]:
     """The best of some focal lengths, from a picture over 250 deg to one over 70 deg of equal angles."""
     width, height = size
     best: tuple[Floats, Floats, Normal] | None = None
@@ -302,7 +315,7 @@ def _fisheye_start(size: tuple[int, int], views: Sequence[View]) -> tuple[Floats
         if poses is None:
             continue
         try:
-            found = minimise("fisheye", theta, poses, views)
+            found = minimise_views("fisheye", theta, poses, views)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
         if np.isfinite(found[2].cost) and (best is None or found[2].cost < best[2].cost):
@@ -312,7 +325,7 @@ def _fisheye_start(size: tuple[int, int], views: Sequence[View]) -> tuple[Floats
     return best[0], best[1]
 
 
-def _fisheye_poses(theta: Floats, views: Sequence[View]) -> Floats | None:
+def _fisheye_poses(theta: Floats, views: Sequence[BoardView]) -> Floats | None:
     import cv2
 
     f, centre, found = theta[0], theta[2:4], []
@@ -330,14 +343,14 @@ def _fisheye_poses(theta: Floats, views: Sequence[View]) -> Floats | None:
     return np.array(found)
 
 
-def check_count(views: Sequence[View]) -> None:
+def check_count(views: Sequence[BoardView]) -> None:
     """Refuse too few views."""
     if len(views) < LEAST_VIEWS:
         remedy = "take 15 to 30 pictures with the board at different places, tilts and distances"
         raise CalibrationError(WHERE, f"the board in {len(views)} pictures", f"at least {LEAST_VIEWS}", remedy)
 
 
-def check_orientations(views: Sequence[View], poses: Floats) -> None:
+def check_orientations(views: Sequence[BoardView], poses: Floats) -> None:
     """Refuse views that are alike, or in which the board has one orientation only."""
     R = exp(poses[:, :3])
     distinct: list[int] = []
@@ -347,19 +360,18 @@ def check_orientations(views: Sequence[View], poses: Floats) -> None:
         if not ((turns < np.radians(ALIKE_DEG)) & (apart < ALIKE_SHARE)).any():
             distinct.append(i)
     if len(distinct) < LEAST_VIEWS:
-        found = f"{len(poses)} views, of which {len(distinct)} differ by {ALIKE_DEG:g} deg or {ALIKE_SHARE:.0%} of the distance"
-        raise CalibrationError(WHERE, found, f"at least {LEAST_VIEWS} that differ", "move and tilt the board between pictures")
+        apart_by = f"{ALIKE_DEG:g} deg or {ALIKE_SHARE:.0%} of the distance"
+        what = f"{len(poses)} views, of which {len(distinct)} differ by {apart_by}"
+        raise CalibrationError(WHERE, what, f"at least {LEAST_VIEWS}", "move and tilt the board between pictures")
     normals = R[:, :, 2]
     tilt = float(np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0)).max()))
     if tilt < LEAST_TILT_DEG:
         found = f"one orientation of the board: its normals differ by {tilt:.1f} deg at most"
-        remedy = "tilt the board by 20 to 45 deg to all sides; a turn within its plane does not count"
-        raise CalibrationError(WHERE, found, f"at least {LEAST_TILT_DEG:g} deg, else the focal length is open", remedy)
+        raise CalibrationError(WHERE, found, f"at least {LEAST_TILT_DEG:g} deg, else the focal length is open", TILT)
 
 
 def _check_focal(found: CameraFit) -> None:
     share = float((found.sigmas[:2] / found.theta[:2]).max())
     if share > LARGEST_FOCAL_SIGMA:
-        remedy = "tilt the board by 20 to 45 deg to all sides, near enough to fill half of the picture"
         what = f"focal length {found.theta[0]:.0f} +- {found.sigmas[0]:.0f} px"
-        raise CalibrationError(WHERE, what, f"a sigma of at most {LARGEST_FOCAL_SIGMA:.0%}", remedy)
+        raise CalibrationError(WHERE, what, f"a sigma of at most {LARGEST_FOCAL_SIGMA:.0%}", TILT)
