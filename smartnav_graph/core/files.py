@@ -150,6 +150,29 @@ def _exchange(first: Path, second: Path) -> bool:
     return rename is not None and rename(at_cwd, os.fsencode(first), at_cwd, os.fsencode(second), exchange) == 0
 
 
+def name_inside(name: str) -> bool:
+    """Whether a name from a log or an archive names a place inside the folder that it counts from.
+
+    Not so: absolute names, ``..``, drives, zero bytes, names that are no UTF-8 or too long for a disk.
+    """
+    parts = name.replace("\\", "/").split("/")
+    try:
+        long = max(len(part.encode()) for part in parts) > 255 or len(name.encode()) > 4000
+    except UnicodeEncodeError:
+        return False
+    return not (long or parts[0] == "" or ".." in parts or "\0" in name or parts[0][1:] == ":")
+
+
+def file_inside(folder: Path, name: str) -> Path | None:
+    """The file `name` of a folder; None where there is none, or the name or a link leads outside, or it is a device."""
+    path = folder / name
+    try:
+        there = name_inside(name) and path.is_file() and path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # too long; links in a circle
+        return None
+    return path if there else None
+
+
 def refuse_foreign(path: str | Path, mark: str) -> None:
     """Raise where `path` is a folder with something in it, but not the `mark` file of the kind to be replaced.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smartnav_graph.core.files import file_inside
 from smartnav_graph.core.timebase import NS, utc_from_gps
 from smartnav_graph.output.text import duration
 from smartnav_graph.session.detect.clock import spaced_rows
@@ -127,7 +128,7 @@ class SessionInfo:
         """Pictures that the images name, and those that are there."""
         images, folder = self.session.images, self.session.pictures
         files = [] if images is None else [file for file in map(str, images.file) if file]
-        return len(files), sum((folder / file).is_file() for file in files) if folder is not None else 0
+        return len(files), sum(file_inside(folder, file) is not None for file in files) if folder is not None else 0
 
     def _gaps(self) -> list[str]:
         gaps = sorted(self.health.gaps, key=lambda gap: -gap.length_s)

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import file_inside
 from smartnav_graph.readers import (
     colmap,
     comma2k19,
@@ -134,9 +135,10 @@ def read(source: str | Path, name: str | None = None, repairs: Iterable[str] = (
         Unknown format, missing or unreadable file, wrong column, a cell that is no number, faulty rows.
     """
     if is_archive(Path(source)):
-        with unpacked(Path(source)) as inside:
+        with unpacked(Path(source)) as (inside, left_out):
             source = _entry(inside)
-            return _without_pictures(find(source, name).read(source, repairs=repairs))
+            found = _without_pictures(find(source, name).read(source, repairs=repairs))
+            return found.replace(dropped={**found.dropped, **({"archive": left_out} if left_out else {})})
     return find(source, name).read(source, repairs=repairs)
 
 
@@ -144,7 +146,7 @@ def _without_pictures(found: Session) -> Session:
     """The session of an archive without its pictures, which are gone with the unpacked folder, and are counted."""
     folder = found.pictures
     files = [] if found.images is None or folder is None else [f for f in map(str, found.images.file) if f]
-    lost = sum((folder / file).is_file() for file in files) if folder is not None else 0
+    lost = sum(file_inside(folder, file) is not None for file in files) if folder is not None else 0
     lost += sum(map(bool, found.images.file)) if found.images is not None and found.write_pictures is not None else 0
     counts = {"images": {"pictures left in the archive (unpack it, and import the folder)": lost}} if lost else {}
     return found.replace(pictures=None, write_pictures=None, dropped={**found.dropped, **counts})

@@ -13,7 +13,7 @@ import tomli_w
 
 from smartnav_graph.core.arrays import Column
 from smartnav_graph.core.errors import CalibrationError, SessionError
-from smartnav_graph.core.files import read_table, read_toml, replacing, write_table
+from smartnav_graph.core.files import file_inside, read_table, read_toml, replacing, write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.session import repair
@@ -56,8 +56,8 @@ def _copy_pictures(session: Session, folder: Path, progress: Progress) -> None:
     if session.images is None or session.pictures is None:
         return
     for file in watched("copying pictures", list(map(str, session.images.file)), progress):
-        source = session.pictures / file
-        if file and not Path(file).is_absolute() and source.is_file():
+        source = file_inside(session.pictures, file)
+        if source is not None:
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, folder / file)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import name_inside
 from smartnav_graph.session.stream import ENU, Label, Located, Positioned, Stream, axes, quantity
 
 
@@ -168,6 +169,13 @@ class Images(Stream):
     camera: Texts = quantity("camera", kind="text")
     exposure_ns: Times | None = quantity("exposure_ns", optional=True, kind="int")
     readout_ns: Times | None = quantity("readout_ns", optional=True, kind="int")
+
+    def _check_rows(self) -> None:
+        super()._check_rows()
+        for row, file in enumerate(map(str, self.file)):
+            if file and not name_inside(file):
+                rule = "a name inside the folder of the pictures: no .., no absolute path, at most 255 bytes a part"
+                raise self._error(f"file is {file[:300]!r} at row {row}", rule, "copy the pictures into it", row)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import file_inside
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Session
@@ -42,7 +43,7 @@ _SMALL_PX = 400
 
 @dataclass(frozen=True)
 class Picture:
-    """One row of the images, with the path of its file."""
+    """One row of the images, with the path of its file; ``Path()`` where there is none."""
 
     image_id: int
     t_ns: int
@@ -83,8 +84,9 @@ def pictures(session: Session) -> list[Picture]:
     if folder is None or not any(images.file):
         found = "lists images, but no files of them"
         raise SessionError(where, found, "files in images/", "its tracks or matches can be used as they are")
-    rows = zip(images.image_id, images.t_ns, images.camera, images.file, strict=True)
-    return [Picture(int(i), int(t), str(camera), str(file), folder / str(file)) for i, t, camera, file in rows]
+    rows = zip(images.image_id, images.t_ns, images.camera, map(str, images.file), strict=True)
+    none = Path()  # no file: where there is none inside the folder
+    return [Picture(int(i), int(t), str(c), file, file_inside(folder, file) or none) for i, t, c, file in rows]
 
 
 def limit_rate(found: list[Picture], rate_hz: float) -> list[Picture]:

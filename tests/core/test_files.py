@@ -192,3 +192,24 @@ def test_force_does_not_replace_a_folder_of_somebodys_own(tmp_path):
     refuse_foreign(tmp_path / "new", "session.toml")
     with pytest.raises(SessionError):
         refuse_foreign(tmp_path / "thesis.doc", "session.toml")
+
+
+@pytest.mark.parametrize(
+    "name", ["../a", "/a", "a/../../b", "a\\..\\b", "C:\\a", "\0", "", "x" * 256, "\udcff", "a/" * 3000]
+)
+def test_names_that_lead_outside(tmp_path, name):
+    assert not files.name_inside(name) and files.file_inside(tmp_path, name) is None
+
+
+def test_only_files_inside_a_folder(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out").write_text("secret")
+    (tmp_path / "in" / "link").symlink_to(tmp_path / "out")
+    (tmp_path / "in" / "circle").symlink_to("circle")
+    os.mkfifo(tmp_path / "in" / "pipe")
+    (tmp_path / "in" / "a").mkdir()
+    (tmp_path / "in" / "a" / "picture.png").write_text("")
+    (tmp_path / "folder").symlink_to("in")
+    for name in ("link", "circle", "pipe", "a", "none"):
+        assert files.file_inside(tmp_path / "in", name) is None
+    assert files.file_inside(tmp_path / "folder", "a/picture.png") == tmp_path / "folder" / "a" / "picture.png"

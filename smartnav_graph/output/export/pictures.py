@@ -188,9 +188,8 @@ def _copy(picture: Picture, place: Place, folder: Path, absolute: bool) -> str:
     """Write one copy; returns why it cannot be written, else nothing."""
     from PIL import Image, UnidentifiedImageError
 
-    name = Path(picture.file)
-    if name.is_absolute() or ".." in name.parts:
-        return "file outside the session"
+    if not picture.path.is_file():
+        return "missing file"
     try:
         data = picture.path.read_bytes()
         with Image.open(picture.path) as opened:
@@ -199,12 +198,10 @@ def _copy(picture: Picture, place: Place, folder: Path, absolute: bool) -> str:
         place_tags.clear()  # an older position with its attributes
         place_tags.update(gps_tags(place, absolute))
         new = with_exif(data, exif.tobytes().removeprefix(b"Exif\0\0"))
-    except FileNotFoundError:
-        return "missing file"
-    except (UnidentifiedImageError, ValueError):
+    except (UnidentifiedImageError, ValueError, Image.DecompressionBombError):
         return "damaged JPEG or PNG"
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_bytes(new)
+    (folder / picture.file).parent.mkdir(parents=True, exist_ok=True)
+    (folder / picture.file).write_bytes(new)
     return ""
 
 

@@ -15,7 +15,7 @@ import tomli_w
 
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.files import replacing
+from smartnav_graph.core.files import file_inside, replacing
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import RADIUS_68
 from smartnav_graph.readers.match_file import on_sensor, write_match_file
@@ -121,8 +121,8 @@ def _pictures(session: Session, images: Images, folder: Path) -> None:
     from PIL import Image
 
     for (number, t), file in zip(_numbered(images), map(str, images.file), strict=True):
-        source = None if session.pictures is None or not file else session.pictures / file
-        if source is None or not source.is_file():
+        source = None if session.pictures is None else file_inside(session.pictures, file)
+        if source is None:
             continue
         target = folder / f"Image_{number}_{_ms(t)}.jpg"
         if source.suffix.lower() in (".jpg", ".jpeg"):

@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.files import file_inside
 from smartnav_graph.core.so3 import exp, rotate, skew
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.health.facts import (
@@ -228,7 +229,7 @@ def _pictures(facts: Facts) -> Iterator[Finding]:
     if images is None:
         return
     files = [file for file in map(str, images.file) if file]
-    lost = [file for file in files if folder is None or not (folder / file).is_file()]
+    lost = [file for file in files if folder is None or file_inside(folder, file) is None]
     if lost:
         done = facts.session.matches is not None or facts.session.tracks is not None
         text = f"{len(lost)} of {len(files)} pictures are missing, the first is {lost[0]}"
