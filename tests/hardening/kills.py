@@ -209,7 +209,8 @@ def strike(folder: Path, name: str, kind: str, rng: random.Random) -> list[str]:
     else:
         before = content(out)
         logging.disable()
-        for target in [out, *(out / f"{stem}{end}" for stem in ("matches", "tracks") for end in (".parquet", ".toml"))]:
+        tables = [out / f"matches{end}" for end in (".parquet", ".toml")] if name == "match" else []
+        for target in [out, *tables]:
             with contextlib.suppress(KeyboardInterrupt), replacing(target):
                 raise KeyboardInterrupt
         if content(out) != before or [p for p in out.parent.iterdir() if p != out]:

@@ -179,3 +179,11 @@ def test_shapes_must_fit_the_stamps():
 
 def test_an_empty_stream_is_valid_in_memory():
     assert len(StaticPeriod(t_ns=[], t_end_ns=[])) == 0
+
+
+def test_a_picture_outside_its_folder_is_refused():
+    images = example(STREAMS["images"])
+    with pytest.raises(
+        SessionError, match=r"images: file is '\.\./secret' at row 1; expected a name inside the folder"
+    ):
+        dataclasses.replace(images, file=[*images.file[:1], "../secret", *images.file[2:]])
