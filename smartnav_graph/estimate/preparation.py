@@ -284,7 +284,7 @@ def trim_span(session: Session, notes: Notes) -> Session:
     first = min(int(stream.t_ns[0]) for stream in aiding) - round(lead_s * NS)
     last = max(int(stream.t_ns[-1]) for stream in aiding) + round(lead_s * NS)
     span = max(notes.span[0], first), min(notes.span[1], last)
-    if span != notes.span:
+    if span != notes.span and (lead_s > 0.0 or shifted):
         begin, end = ((t_ns - session.t0_ns) / NS for t_ns in span)
         why = f"{lead_s:g} s around the first and last absolute measurement; raise keyframes.lead_s to reckon further"
         if shifted:

@@ -9,6 +9,7 @@ import numpy as np
 
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.constant_velocity import PREPARE_POSITIONS
 from smartnav_graph.estimate.preparation import PREPARE, Notes, dropped_text, on_one_datum, unused_streams
 from smartnav_graph.factors import make_builders
 from smartnav_graph.factors.context import FactorContext
@@ -16,7 +17,7 @@ from smartnav_graph.graph import delayed
 from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.session.calibration.model import Calibration
+from smartnav_graph.session.calibration.model import WHITE_ACCELERATION, Calibration
 from smartnav_graph.session.detect.heights import HeightLevels
 from smartnav_graph.session.detect.stances import STANCE_SPACING_S, SWING_S
 from smartnav_graph.session.detect.standstills import Standstills
@@ -67,6 +68,15 @@ class Problem:
         return replace(self, dropped=dropped, warnings=[*self.warnings, *texts])
 
     @property
+    def positions_only(self) -> bool:
+        """Whether a motion model stands in place of inertial data; see `constant_velocity`."""
+        return self.calibration.imu_noise is WHITE_ACCELERATION
+
+    def label(self, sensor: str) -> str:
+        """Name of a sensor in results: what is in place of inertial data is none."""
+        return sensor.replace("imu", "motion_model") if self.positions_only else sensor
+
+    @property
     def rests_at_start(self) -> bool:
         """Whether the first keyframe lies in a rest that has standstill factors of its own."""
         options, rests = self.config.standstill, self.rests
@@ -77,7 +87,7 @@ class Problem:
 
 
 def prepare(session: Session, config: Config, *, causal: bool = False) -> Problem:
-    """The steps of `PREPARE`, then windows and builders.
+    """The steps of `PREPARE`, or of `PREPARE_POSITIONS` where there are no inertial data, then windows and builders.
 
     causal : a row is used when it becomes known (replay); otherwise at its measurement time
 
@@ -89,8 +99,10 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
         An option names what is not there.
     """
     notes = Notes(config, causal)
-    for step in PREPARE.values():
+    positions_only = session.imu is None and bool(session.positions())
+    for step in (PREPARE_POSITIONS if positions_only else PREPARE).values():
         session = step(session, notes)
+    config = notes.config
     context = FactorContext(
         *(session, notes.calibration, notes.gaps, config.run.vehicle or session.device.vehicle, config),
         *(notes.rests, causal, notes.pairs),

@@ -16,6 +16,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.alignment.initialiser import find_initial_state
 from smartnav_graph.estimate.alignment.inputs import first_stretch
+from smartnav_graph.estimate.alignment.positions_only import first_position
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.passes import StageTimes, causal_start, solve_passes
 from smartnav_graph.estimate.problem import Problem, prepare
@@ -59,11 +60,15 @@ class Run:
 
     @property
     def session(self) -> Session:
-        return self.problem.session
+        """As it was solved; without the stream of a motion model."""
+        session = self.problem.session
+        return session.replace(imu=None) if self.problem.positions_only else session
 
 
 def initialise(problem: Problem, longest_s: float | None = None) -> InitialState:
     """First state of a problem; `longest_s` bounds the stretch it is found on (replay)."""
+    if problem.positions_only:
+        return first_position(problem)
 
     def solve(
         prior: PriorBuilder, count: int, pass_state: PassState, initial_values: gtsam.Values | None

@@ -27,7 +27,7 @@ from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassSt
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import Builder, FactorId, GraphUpdate
 from smartnav_graph.graph.windows import Window
-from smartnav_graph.session.calibration.model import DEVICE_CLASSES, ImuNoise
+from smartnav_graph.session.calibration.model import DEVICE_CLASSES, WHITE_ACCELERATION, ImuNoise
 from smartnav_graph.session.detect.scatter import sampling_noise
 
 Pim = gtsam.PreintegratedImuMeasurements
@@ -310,7 +310,7 @@ class ImuBuilder(Builder):
 def build(context: FactorContext) -> ImuBuilder:
     """The builder of a session's inertial data."""
     noise = context.calibration.imu_noise
-    known = noise != DEVICE_CLASSES[context.calibration.device_class]
+    known = noise not in (DEVICE_CLASSES[context.calibration.device_class], WHITE_ACCELERATION)
     weight = CALIBRATED_WEIGHT if known else CLASS_WEIGHT
     gravity, options = context.session.gravity, context.options(ImuConfig)
     imu = context.session.require_imu()

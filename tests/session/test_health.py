@@ -192,8 +192,11 @@ def test_constant_aiding():
 
 
 def test_missing_empty_and_short_streams():
-    with pytest.raises(SessionError, match="no inertial stream"):
-        inspect(Session(gnss=make_fixes())).raise_errors()
+    with pytest.raises(SessionError, match="no inertial data"):
+        inspect(make_session(imu=None, gnss=None)).raise_errors()
+    positions_only = inspect(Session(gnss=make_fixes()))
+    positions_only.raise_errors()
+    assert "imu: there are no inertial data: positions are smoothed" in only(positions_only, "warning")
     with pytest.raises(SessionError, match="gnss: has no rows"):
         inspect(make_session(gnss=make_fixes(0.0, 0.0))).raise_errors()
     with pytest.raises(SessionError, match="one row only"):

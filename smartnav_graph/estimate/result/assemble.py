@@ -20,10 +20,11 @@ from smartnav_graph.estimate.reweight.outliers import FixResiduals, fix_residual
 from smartnav_graph.estimate.reweight.track_outliers import whitened
 from smartnav_graph.factors.coplanarity import SMART
 from smartnav_graph.factors.gnss import PositionBuilder
+from smartnav_graph.factors.prior import UNKNOWN_ANGLE
 from smartnav_graph.graph.interpolate import Kinematics, kinematics, states_at
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import loss_weights
-from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.graph.solution import ROT, Residuals, Solution
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.streams import ABSOLUTE
@@ -72,6 +73,10 @@ class Withheld:
 
 def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, covariance: Floats) -> Solution:
     session = problem.session
+    if problem.positions_only:  # the level attitude of the motion model is not that of the device
+        covariance = covariance.copy()
+        covariance[:, ROT], covariance[:, :, ROT] = 0.0, 0.0
+        covariance[:, range(3), range(3)] = UNKNOWN_ANGLE**2
     return Solution(
         t_ns=t_ns,
         nav_R_body=states.R,
@@ -145,9 +150,9 @@ def residuals(solved: SolvedProblem) -> Residuals:
             rows.append(factor.whitenedError(estimate.values))
     for sensor, (stamps, rows) in native.items():
         count = len(rows)
-        parts.append(
-            (np.array(stamps, dtype=np.int64), sensor, np.array(rows), np.ones(count), np.ones(count, dtype=bool))
-        )
+        used = np.ones(count, dtype=bool)
+        stamps_ns = np.array(stamps, dtype=np.int64)
+        parts.append((stamps_ns, problem.label(sensor), np.array(rows), np.ones(count), used))
     return _flat(parts)
 
 

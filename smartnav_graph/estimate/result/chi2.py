@@ -76,8 +76,9 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: Account | None) -
         count -= _unknown_heights(solved, name)
         if name == SMART and tracks is not None:
             count -= POINT_DOF * tracks.used
-        before = parts.get(builder_of(name), SensorFit())
-        parts[builder_of(name)] = SensorFit(
+        sensor = solved.problem.label(builder_of(name))
+        before = parts.get(sensor, SensorFit())
+        parts[sensor] = SensorFit(
             residuals=before.residuals + count,
             redundancy=before.redundancy + count - found.fitted,
             square=before.square + square,

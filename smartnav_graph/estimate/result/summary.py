@@ -52,10 +52,12 @@ def peak_memory_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
 
+POSITIONS_ONLY = "positions only"  # mode without inertial data; see `estimate.constant_velocity`
+
 
 def _doubts(estimate: Estimate, mode: str, chi2: float) -> list[str]:
     doubts = []
-    if mode != "batch":
+    if mode not in ("batch", POSITIONS_ONLY):
         relative = mode.replace("dead-", "dead ")
         doubts.append(f"{relative}: no absolute position measurement, errors grow with time; add position fixes")
     if not estimate.converged:
@@ -86,6 +88,7 @@ def summarise(
     chi2 = fit.per_dof()
     images = (seen is not None and seen.used > 0) or (tracks is not None and tracks.in_force)
     mode = "batch" if used else "visual-inertial odometry" if images else "dead-reckoning"
+    mode = POSITIONS_ONLY if problem.positions_only else mode
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused]
@@ -99,7 +102,7 @@ def summarise(
         "duration_s": duration,
         "path_m": keyframes.path_length(),
         "keyframes": len(keyframes),
-        "factors": _factor_counts(estimate),
+        "factors": {problem.label(name): count for name, count in _factor_counts(estimate).items()},
         "chi2_per_dof": chi2,
         "redundancy": {name: round(part.redundancy, 3) for name, part in fit.parts.items()},
         "without_chi2": fit.reasons(),
@@ -195,6 +198,9 @@ def _state(value: object, sigma: object = None, *, held: bool = False) -> dict[s
 def _noise(problem: Problem, pass_state: PassState) -> dict[str, dict[str, Any]]:
     """Noise densities, bias walks and sigmas of the constraints; held where the data said too little of them."""
     noise = problem.calibration.imu_noise
+    if problem.positions_only:
+        density = float(f"{noise.accel_noise_density * pass_state.scale('accel'):.4g}")
+        return {"motion_model_acceleration_density": _state(density, held="accel" not in pass_state.noise_scales)}
     inertial = NOISE_NAMES if problem.config.imu.estimate_noise else {}
     used = [(name, group, getattr(noise, name)) for group, name in inertial.items()]
     for builder in problem.builders:

@@ -112,7 +112,8 @@ Test = Callable[[VerdictInputs], Iterator[Reason]]
 
 def verdict(inputs: VerdictInputs) -> dict[str, object]:
     """The verdict as in summary.json: level, and reasons, worst first."""
-    reasons = [reason for test in TESTS for reason in test(inputs)]
+    tests = POSITIONS_ONLY if inputs.solved.problem.positions_only else TESTS
+    reasons = [reason for test in tests for reason in test(inputs)]
     reasons.sort(key=lambda reason: -LEVELS.index(reason.level))
     return {"level": reasons[0].level if reasons else LEVELS[0], "reasons": [reason.to_dict() for reason in reasons]}
 
@@ -289,3 +290,5 @@ TESTS: tuple[Test, ...] = (
     *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _biases, _alike),
     *(_predictions, _solver),
 )
+# What compares positions with inertial data says nothing of a motion model.
+POSITIONS_ONLY: tuple[Test, ...] = (_recording, _misfits, _rejected, _alike, _solver)

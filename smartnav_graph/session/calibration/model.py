@@ -156,6 +156,16 @@ DEVICE_CLASSES: dict[str, ImuNoise] = {
         gyro_bias_sigma=0.05,
     ),
 }
+# The motion model of positions without inertial data (`estimate.constant_velocity`): acceleration as of walkers and
+# cars within a factor of three, of a device that stays level.
+WHITE_ACCELERATION = ImuNoise(
+    accel_noise_density=1.0,
+    gyro_noise_density=1e-5,
+    accel_bias_walk=1e-6,
+    gyro_bias_walk=1e-9,
+    accel_bias_sigma=1e-4,
+    gyro_bias_sigma=1e-7,
+)
 
 
 @dataclass(frozen=True)

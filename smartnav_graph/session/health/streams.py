@@ -24,7 +24,12 @@ def _rows(facts: Facts) -> Iterator[Finding]:
         if not len(stream):
             yield Finding(name, "has no rows", "remove the stream, or import the log again", "error")
     if session.imu is None:
-        yield Finding("imu", "there is no inertial stream", "the IMU is required; import one", "error")
+        text, remedy = "there are no inertial data", "record accelerometer and gyroscope at 20 Hz or more"
+        if counts := session.dropped.get("imu"):
+            text += f" ({', '.join(f'{count} rows {reason}' for reason, count in counts.items())})"
+        if session.positions():
+            text += ": positions are smoothed with constant velocity between them, attitude is not estimated"
+        yield Finding("imu", text, remedy, "warning" if session.positions() else "error")
     elif 0 < len(session.imu) < 2:
         yield Finding("imu", "has one row only", "import at least two", "error")
     elif len(session.imu) and (length := (session.imu.t_ns[-1] - session.imu.t_ns[0]) / NS) < 1.0:
