@@ -52,6 +52,7 @@ def peak_memory_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
 
+
 POSITIONS_ONLY = "positions only"  # mode without inertial data; see `estimate.constant_velocity`
 
 
