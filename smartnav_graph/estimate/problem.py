@@ -69,7 +69,7 @@ class Problem:
 
     @property
     def positions_only(self) -> bool:
-        """Whether a motion model stands in place of inertial data; see `constant_velocity`."""
+        """Whether a motion model replaces the inertial data; see `constant_velocity`."""
         return self.calibration.imu_noise is WHITE_ACCELERATION
 
     def label(self, sensor: str) -> str:
