@@ -7,8 +7,10 @@ good as without the fault, to `WORSE` times its horizontal error.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +19,11 @@ import smartnav_graph as sn
 from smartnav_graph.core.errors import SmartnavError
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import StaticPeriod
+from smartnav_graph.session.streams import ControlPoint, StaticPeriod
+from smartnav_graph.simulation.fixes import PoseFixModel
+from smartnav_graph.simulation.scenarios import find_scenario
 
+DATASETS = Path(os.environ.get("SMARTNAV_DATASETS", Path(__file__).resolve().parents[1] / "../shared/datasets"))
 WORSE = 1.5
 Rng = np.random.Generator
 Fault = Callable[[Session, Rng], Session | None]
@@ -132,6 +137,13 @@ def _burst(size_m: float, length_s: float) -> Fault:
         return p + np.where(inside, size_m, 0.0)[:, None] * [np.cos(way), np.sin(way), 0.0]
 
     return position(shift)
+
+
+def _apart(
+    where: Callable[[np.ndarray], np.ndarray], shift: tuple[float, float, float]
+) -> Callable[[np.ndarray, np.ndarray, Rng], np.ndarray]:
+    """Some rows shifted."""
+    return lambda t, p, rng: p + where(np.arange(len(p)))[:, None] * np.array(shift)
 
 
 def _stale(t: np.ndarray, p: np.ndarray, rng: Rng) -> np.ndarray:
@@ -254,7 +266,7 @@ FAULTS: Mapping[str, Fault] = {
     "stale fixes": position(_stale),
     "filtered fixes": position(_filtered),
     "sigma / 100": white(3.0, 0.03),
-    "focal length x 1.2": focal_length(1.2),
+    **{f"focal length x {factor:g}": focal_length(factor) for factor in (1.03, 1.05, 1.1, 1.2)},
     "camera clock 0.2 s": camera_clock(0.2),
     "pressure in Pa": _pascal,
     "false standstill": _standstill,
@@ -289,6 +301,13 @@ OTHERS: Mapping[str, Fault] = {
     "half of the fixes 1000 km away": position(
         lambda t, p, rng: p + np.where(rng.random(len(t)) < 0.5, 1e6, 0.0)[:, None] * [1.0, 0.0, 0.0]
     ),
+    "every second fix 150 m away": position(_apart(lambda rows: rows % 2, (150.0, 0.0, 0.0))),
+    "half of the fixes 150 m away": position(
+        lambda t, p, rng: p + np.where(rng.random(len(t)) < 0.5, 150.0, 0.0)[:, None] * [0.6, 0.8, 0.0]
+    ),
+    "blocks of fixes 150 m away": position(_apart(lambda rows: (rows // 15) % 2, (0.0, 150.0, 0.0))),
+    "two receivers 25 m apart": position(_apart(lambda rows: rows % 2, (15.0, 20.0, 0.0))),
+    "two height datums": position(_apart(lambda rows: rows % 2, (0.0, 0.0, 47.0))),
     "heights 47 m up": position(lambda t, p, rng: p + np.where(t > 0.5 * t[-1], 47.0, 0.0)[:, None] * [0.0, 0.0, 1.0]),
     "sigma x 100": _sigmas(100.0),
     "focal length x 0.8": focal_length(0.8),
@@ -367,11 +386,32 @@ def recording(name: str, seed: int) -> Session:
 
 def _camera_with_fixes(seed: int) -> Session:
     """Half a minute in a room with a camera, pose fixes every second."""
-    from smartnav_graph.simulation.fixes import PoseFixModel
-    from smartnav_graph.simulation.scenarios import find_scenario
-
     pose_fixes = PoseFixModel(every_s=1.0, sigma_m=0.2, sigma_rad=0.0)
     return replace(find_scenario("room-30s"), pose_fixes=pose_fixes)(seed)
 
 
-SCENES: Mapping[str, Callable[[int], Session]] = {"camera-fixes": _camera_with_fixes}
+def _trolley_with_camera(seed: int) -> Session:
+    """Six minutes of a trolley with surveyed points and matched images."""
+    return replace(find_scenario("thesis-indoor"), seconds=400.0)(seed)
+
+
+def _euroc(seed: int) -> Session:
+    """The half minute of EuRoC that comes with gtsam, with a point of the truth every three seconds."""
+    session, truth = (
+        sn.load("gtsam-euroc"),
+        sn.load_reference(DATASETS / "euroc_v101/groundtruth_openvins/V1_01_easy.csv"),
+    )
+    at = session.seconds(truth.t_ns)
+    truth = truth.take((at > 0.0) & (at < 29.9))
+    rows = np.searchsorted(session.seconds(truth.t_ns), np.arange(1.0, 29.0, 3.0))
+    enu = truth.enu[rows] + np.random.default_rng(seed).normal(0.0, 0.02, (len(rows), 3))
+    names = np.array([f"P{row}" for row in rows], dtype=object)
+    points = ControlPoint(t_ns=truth.t_ns[rows], enu=enu, sigma=np.full(enu.shape, 0.02), point_id=names)
+    return session.replace(control=points, reference=truth)
+
+
+SCENES: Mapping[str, Callable[[int], Session]] = {
+    "camera-fixes": _camera_with_fixes,
+    "trolley-images": _trolley_with_camera,
+    "euroc": _euroc,
+}

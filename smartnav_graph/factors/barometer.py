@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import norm
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
@@ -35,6 +36,8 @@ from smartnav_graph.session.streams import Barometer
 SEA_LEVEL_HPA = 1013.25
 SEA_LEVEL_K, LAPSE_K_M, EXPONENT = 288.15, 0.0065, 5.25588
 HALF_S = 0.5  # samples this long after a keyframe are used: the look-ahead
+# Samples that show their noise: number, and spacing at most, over which a lift changes its speed by 0.1 m/s.
+LEAST_SAMPLES, CLOSE_S = 50, 0.1
 UNKNOWN_HEIGHT = 1000.0  # m, of a local frame over the pressure at its start
 
 
@@ -154,8 +157,17 @@ def build(context: FactorContext) -> BarometerBuilder | None:
     height, sigma = _heights(stream, context), UNKNOWN_HEIGHT
     if options.reference_hpa is not None:
         sigma = options.reference_sigma
-    scale = metres_a_hpa(float(stream.pressure_hpa[0]))
-    return BarometerBuilder(stream.t_ns, height, scale, sigma, context.calibration.barometer_noise, options.loss)
+    scale, noise = metres_a_hpa(float(stream.pressure_hpa[0])), context.calibration.barometer_noise
+    noise = replace(noise, pressure_sigma=max(noise.pressure_sigma, scatter_hpa(stream)))
+    return BarometerBuilder(stream.t_ns, height, scale, sigma, noise, options.loss)
+
+
+def scatter_hpa(stream: Barometer) -> float:
+    """White noise (hPa) of samples by the median of their second differences, which have six times its variance; zero
+    where these are too far apart to show it beside a change of height."""
+    if len(stream) < LEAST_SAMPLES or float(np.median(np.diff(stream.t_ns))) > CLOSE_S * NS:
+        return 0.0
+    return float(np.median(np.abs(np.diff(stream.pressure_hpa, n=2))) / (norm.ppf(0.75) * np.sqrt(6.0)))
 
 
 def _heights(stream: Barometer, context: FactorContext) -> Floats:

@@ -14,12 +14,20 @@ import smartnav_graph as sn
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS, ns_from_seconds
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors.barometer import BarometerBuilder, BarometerConfig, Height, icao_height, metres_a_hpa
+from smartnav_graph.factors.barometer import (
+    BarometerBuilder,
+    BarometerConfig,
+    Height,
+    icao_height,
+    metres_a_hpa,
+    scatter_hpa,
+)
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State, key
 from smartnav_graph.graph.update import GraphUpdate
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import BarometerNoise
+from smartnav_graph.session.streams import Barometer
 
 
 def test_the_standard_atmosphere():
@@ -182,3 +190,12 @@ def test_the_bias_walks_with_the_root_of_the_time():
         (walk,) = (factor for tag, factor in update.factors if tag.sensor == "barometer_bias")
         sigmas.append(walk.noiseModel().sigmas()[0])
     assert sigmas == pytest.approx([0.5 * 8.4 * 0.003, 8.4 * 0.003, 2.0 * 8.4 * 0.003])
+
+
+def test_samples_show_their_own_noise_while_a_lift_goes_up_and_a_door_slams():
+    t = np.arange(0.0, 60.0, 0.02)
+    pressure = 1000.0 - 0.12 * 2.0 * t + np.random.default_rng(0).normal(0.0, 0.1, len(t))  # 2 m/s
+    pressure[1000:1010] += 2.0
+    stream = Barometer(t_ns=ns_from_seconds(t), pressure_hpa=pressure)
+    assert scatter_hpa(stream) == pytest.approx(0.1, rel=0.1)  # hPa
+    assert scatter_hpa(stream.take(slice(None, None, 50))) == 0.0  # too far apart

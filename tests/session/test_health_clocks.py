@@ -5,7 +5,8 @@ import pytest
 from sessions import shifted
 
 from smartnav_graph.session import health
-from smartnav_graph.session.health.clocks import apply_offsets, compare_clocks
+from smartnav_graph.session.detect.clock import ClockOffset
+from smartnav_graph.session.health.clocks import apply_offsets, beyond_state, compare_clocks
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +48,11 @@ def test_the_lag_of_a_receiver_is_no_finding_and_small_enough_for_its_state(driv
 def test_a_session_without_fixes_or_inertial_data(drive) -> None:
     assert not compare_clocks(drive.replace(gnss=None)).offsets
     assert not compare_clocks(drive.replace(imu=None)).offsets
+
+
+def test_an_offset_that_may_be_no_more_than_a_receiver_is_late_is_left_to_the_state():
+    def offset(lag_s: float, sigma_s: float) -> ClockOffset:
+        return ClockOffset("gnss", lag_s, sigma_s, 50.0, True, lag_s, lag_s)
+
+    assert beyond_state(offset(-1.9, 0.3)) and beyond_state(offset(1.6, 0.05))
+    assert not beyond_state(offset(-1.7, 0.3)) and not beyond_state(offset(1.4, 0.05))  # s

@@ -5,7 +5,8 @@ With whitened residuals r and Jacobian A of all factors at the solution, and the
     x = -(J^T M J)^-1 J^T M r      cov x = (J^T M J)^-1      M = 1 - A (A^T A)^-1 A^T
 
 is what one more iteration of least squares with x as states without priors finds. Tested one by one are the clock
-offset of each position sensor, its rate, a jump of it, the lever arm, and scale factors of accelerometer and gyroscope.
+offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of accelerometer and gyroscope, and
+the focal length of the camera.
 
 Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.4; Rao (1973), Linear statistical inference, 6e.
 """
@@ -13,6 +14,7 @@ Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.4; Rao (1
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,12 +26,13 @@ from scipy.sparse.linalg import splu
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.result.assemble import SolvedProblem
+from smartnav_graph.factors.coplanar_rows import CompressedRows
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.states import key, kind_of
 from smartnav_graph.graph.update import FactorId, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.redundancy import CALIBRATION
-from smartnav_graph.smoothers.whole_graph import WholeGraph
+from smartnav_graph.smoothers.whole_graph import Snapshot, WholeGraph
 
 # Parts of the fixes between which a clock may jump, and the least number of fixes that are tested.
 PARTS, LEAST_FIXES = 10, 6
@@ -37,13 +40,15 @@ PARTS, LEAST_FIXES = 10, 6
 LEAST_LEFT = 1e-6
 # Variance of the mean readings of windows over that of their noise, from which a scale factor shows.
 EXCITED = 250.0
+# Factors of image pairs, and a small relative change of the focal length.
+PAIRS, FOCAL_STEP = "image_pairs", 1e-4
 
 
 @dataclass(frozen=True)
 class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
     stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale`` and ``gyro
-    scale`` along the body axis `axis`."""
+    scale`` along the body axis `axis`; ``focal length`` (relative)."""
 
     sensor: str
     kind: str
@@ -56,8 +61,8 @@ class SensorError:
 def sensor_errors(solved: SolvedProblem) -> list[SensorError]:
     """Every error that the data determine."""
     names, linear = _linearized(solved.estimate)
-    parts = _parts(names, linear, {*solved.fixes, "imu"})
-    found = [*_of_positions(solved, parts), *_of_inertial_data(solved, parts)]
+    parts = _parts(names, linear, {*solved.fixes, "imu", PAIRS})
+    found = [*_of_positions(solved, parts), *_of_inertial_data(solved, parts), *_of_images(solved, parts)]
     if not found:
         return []
     i, j, value = linear.sparseJacobian_()
@@ -177,3 +182,23 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator
         for axis in np.flatnonzero(varies):
             derivatives = [(row, J[:, column + axis] * mean[k, axis]) for k, (row, J, _) in enumerate(rows)]
             yield SensorError("imu", kind, "xyz"[axis]), derivatives
+
+
+def _of_images(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+    """Directions by a focal length that is too small are too far from the axis: x (1 + f), y (1 + f) in every match,
+    which is vec(E) with its entries multiplied by 1, 1 + f or (1 + f)^2."""
+    by_pair = {part.name.row: part.row for part in parts if part.name.sensor == PAIRS}
+    rows = list[tuple[int, Floats]]()
+    across = np.array([1.0 + FOCAL_STEP, 1.0 + FOCAL_STEP, 1.0])
+    for stack in solved.estimate.stacks(PAIRS):
+        if not isinstance(stack.model, CompressedRows):
+            continue
+        moved = copy(stack.model)
+        moved.root = stack.model.root.copy()
+        moved.root[:, :, :9] *= np.outer(across, across).ravel()
+        states = stack.states(Snapshot(solved.estimate.values, solved.estimate.held))
+        change = [model.linearize(states, stack.data)[0] for model in (moved, stack.model)]
+        derivative = (change[0] - change[1]) / FOCAL_STEP
+        rows += [(by_pair[row], derivative[k]) for k, row in enumerate(stack.rows.tolist()) if row in by_pair]
+    if len(rows) >= LEAST_FIXES:
+        yield SensorError(PAIRS, "focal length"), rows

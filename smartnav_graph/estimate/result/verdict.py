@@ -11,8 +11,9 @@ doubtful : the result may be wrong by more than its covariance says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -22,7 +23,9 @@ from smartnav_graph.core.arrays import Floats, Times, runs
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
+from smartnav_graph.estimate.result.left_out import left_out
 from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
+from smartnav_graph.estimate.reweight.image_pair_outliers import pair_account
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
 from smartnav_graph.factors.imu import ImuBuilder
@@ -33,20 +36,28 @@ from smartnav_graph.session.health.clocks import STATE_S
 LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
 MISFIT, EXCLUDED = 2.0, 6.0
+# One of sensors that agree, and one where residuals are no less than their sigmas.
+FITS, NO_LESS = 1.5, 0.8
 # Sensors under a redescending loss: their tails are expected.
 ROBUST = (*IMAGES, "magnetometer")
 # How rarely a sensor that fits reaches its chi-square.
 RARE = 1e-6
 # Consecutive rejected fixes, seconds of them, and share of all, that speak against the solution rather than the fixes.
 REJECTED_RUN, REJECTED_S, REJECTED_SHARE, MOST_REJECTED = 4, 3.0, 0.1, 0.3
+# Share of the image pairs that contradict the other sensors where nothing is wrong but single images.
+CONTRARY_SHARE = 0.1
 # Biases beyond so many sigmas of what was known of them.
 FAR = 4.0
 # Noise of a constraint of the motion over that of its class.
 WIDE = 6.0
 # Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
 ALIKE, LEAST_PAIRS = 0.35, 40
+# Fourth moment over the square of the second, and distance (m) of two places that fixes are at in turns.
+TWO_PLACES, LEAST_APART_M = 1.6, 1.0
 # RMS at withheld fixes against that of interpolating the kept ones, and the least number of them.
 WORSE_THAN_INTERPOLATION, LEAST_WITHHELD = 1.1, 20
+# Standard deviations by which a mean of squares is clearly larger.
+CLEARLY = 4.0
 
 
 @dataclass(frozen=True)
@@ -75,8 +86,13 @@ LIMITS = {
     "accelerometer scale": Limit(
         0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer, or check its axes and unit"
     ),
+    "focal length": Limit(0.015, 5.0, "the motion fits a focal length {percent:+.1f} % longer", "calibrate the camera"),
     "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
 }
+
+
+# The shocks of steps, and what they do to a gyroscope, look like scale errors of so many times these.
+ON_FOOT = 2.5
 
 
 @dataclass(frozen=True)
@@ -105,6 +121,17 @@ class VerdictInputs:
     fit: Chi2
     withheld: Mapping[str, Withheld]
     together: bool
+
+    @cached_property
+    def errors(self) -> Sequence[SensorError]:
+        """Errors of sensors without a state, where the states were solved together."""
+        return sensor_errors(self.solved) if self.together else ()
+
+    @property
+    def on_foot(self) -> bool:
+        """Whether the device swings with a foot."""
+        rests = self.solved.problem.rests
+        return rests is not None and rests.on_foot
 
 
 Test = Callable[[VerdictInputs], Iterator[Reason]]
@@ -199,11 +226,12 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
     worst: dict[str, SensorError] = {}
     misfit = inputs.fit.per_dof()
     session = inputs.solved.problem.session
-    for error in sensor_errors(inputs.solved) if inputs.together else ():
+    for error in inputs.errors:
         limit = LIMITS[error.kind]
         error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
-        clear = abs(error.value) > max(limit.size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
+        size = limit.size * (ON_FOOT if error.sensor == "imu" and inputs.on_foot else 1.0)
+        clear = abs(error.value) > max(size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
         known = worst.get(error.sensor)
         if clear and (known is None or abs(error.value / error.sigma) > abs(known.value / known.sigma)):
             worst[error.sensor] = error
@@ -212,6 +240,17 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
         start = None if error.t_ns is None else float(session.seconds(error.t_ns))
         text = limit.text.format(value=error.value, axis=error.axis, percent=100.0 * error.value)
         yield Reason(LEVELS[1], sensor, text, limit.remedy, error.value, start)
+
+
+def _images(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Images that contradict the other sensors."""
+    seen = pair_account(inputs.solved.problem.builders, inputs.solved.pass_state)
+    share = 0.0 if seen is None else seen.contrary / max(seen.used + seen.contrary, 1)
+    if seen is not None and (seen.refused or share > CONTRARY_SHARE):
+        none = ", and none is used" if seen.refused else ""
+        text = f"{100 * share:.0f} % of the image pairs contradict the other sensors{none}"
+        remedy = "check clock and calibration of the camera, or add fixes, control points or standstills"
+        yield Reason(LEVELS[1], "image_pairs", text, remedy, share)
 
 
 def _biases(inputs: VerdictInputs) -> Iterator[Reason]:
@@ -240,6 +279,21 @@ def _alike(inputs: VerdictInputs) -> Iterator[Reason]:
             yield Reason(LEVELS[1], name, text, "give larger sigmas; the covariance is too small", rho)
 
 
+def _two_places(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Fixes on both sides of the solution and none on it, as of two receivers, places or height datums: along the axis
+    of the largest spread d their fourth moment is little more than d^4, three times that if normal."""
+    for name, residuals in inputs.solved.fixes.items():
+        for axes, what in ((slice(0, 2), "fixes"), (slice(2, 3), "heights of the fixes")):
+            r = residuals.residual[:, axes] - residuals.residual[:, axes].mean(axis=0)
+            if len(r) <= LEAST_PAIRS:
+                continue
+            along = r @ np.linalg.eigh(r.T @ r)[1][:, -1]
+            apart = 2.0 * float(along.std())
+            if apart > LEAST_APART_M and np.mean(along**4) < TWO_PLACES * np.mean(along**2) ** 2:
+                text = f"{what} are alternately of two places, {apart:.1f} m apart"
+                yield Reason(LEVELS[2], name, text, "look whether two receivers or datums were merged", apart)
+
+
 def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
     """Withheld fixes: the solution against interpolation of the kept ones."""
     session = inputs.solved.problem.session
@@ -254,6 +308,20 @@ def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
         if ours > WORSE_THAN_INTERPOLATION * theirs:
             text = f"withheld fixes are predicted to {ours:.2f} m, to {theirs:.2f} m by interpolation of the kept ones"
             yield Reason(LEVELS[1], name, text, "check clock, axes and calibration of the inertial data", ours)
+
+
+def _left_out(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Fixes left out one by one: the solution against curves through their neighbours, where the residuals are no less
+    than the sigmas: the solution follows fixes no better than these say."""
+    misfit = inputs.fit.per_dof()
+    for found in left_out(inputs.solved, LEAST_WITHHELD) if inputs.together else ():
+        ours, theirs = found.rms
+        worse = ours > WORSE_THAN_INTERPOLATION * theirs and found.sigmas > CLEARLY
+        if worse and misfit.get(found.sensor, 1.0) > NO_LESS:
+            text = (
+                f"fixes left out one by one are predicted to {ours:.2f} m, by their neighbours alone to {theirs:.2f} m"
+            )
+            yield Reason(LEVELS[1], found.sensor, text, "check clock, axes, lever arm and calibration", ours)
 
 
 def interpolated(t_ns: Times, kept_ns: Times, position: Floats) -> tuple[Floats, Floats]:
@@ -273,10 +341,20 @@ def _recording(inputs: VerdictInputs) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
     t0 = inputs.solved.problem.session.t0_ns
     for finding in inputs.solved.problem.findings:
-        if finding.verdict == LEVELS[0]:
+        jump = finding in inputs.solved.problem.clocks.jumps
+        if finding.verdict == LEVELS[0] or (jump and _keeps_time(inputs, finding.where)):
             continue
         start, end = (None if t_ns is None else (t_ns - t0) / NS for t_ns in (finding.start_ns, finding.end_ns))
         yield Reason(finding.verdict, finding.where, finding.text, finding.remedy, finding.size, start, end)
+
+
+def _keeps_time(inputs: VerdictInputs, sensor: str) -> bool:
+    """Whether the solution shows that the clock of a sensor does not jump: where a motion is repeated, its parts are
+    alike, and stamps that fit one fit another."""
+    jumps = [error for error in inputs.errors if (error.sensor, error.kind) == (sensor, "clock jump")]
+    misfit = inputs.fit.per_dof()
+    fits = all(misfit.get(name, np.inf) < FITS for name in (sensor, "imu"))
+    return fits and bool(jumps) and all(abs(j.value) + 3.0 * j.sigma < STATE_S for j in jumps)
 
 
 def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
@@ -287,8 +365,8 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
 
 # What names a cause comes before what it makes of the solution.
 TESTS: tuple[Test, ...] = (
-    *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _biases, _alike),
-    *(_predictions, _solver),
+    *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _images, _biases),
+    *(_alike, _two_places, _predictions, _left_out, _solver),
 )
 # What compares positions with inertial data says nothing of a motion model.
 POSITIONS_ONLY: tuple[Test, ...] = (_recording, _misfits, _rejected, _alike, _solver)

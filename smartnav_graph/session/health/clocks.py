@@ -28,11 +28,13 @@ _SENSORS = ("gnss", "pose_fixes")
 class ClockReport:
     """What a comparison of the position sensors with the inertial data finds.
 
-    offsets : of each sensor that could be compared; faults : of axes and of the stamps within a stream
+    offsets : of each sensor that could be compared; faults : of axes and of the stamps within a stream; jumps : those
+    of the faults that are jumps of the stamps
     """
 
     offsets: tuple[ClockOffset, ...] = ()
     faults: tuple[Finding, ...] = ()
+    jumps: tuple[Finding, ...] = ()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -60,7 +62,7 @@ def compare_clocks(session: Session) -> ClockReport:
         name: FixTrack.of(stream.t_ns, session.nav_position(stream), motion.start_ns)
         for name, stream in streams.items()
     }
-    offsets, faults = [], []
+    offsets, faults, jumps = list[ClockOffset](), list[Finding](), list[Finding]()
     for name, track in tracks.items():
         offset = find_clock_offset(name, motion, track)
         if offset is None:
@@ -72,13 +74,14 @@ def compare_clocks(session: Session) -> ClockReport:
         elif change := find_clock_change(motion, track, lag_s):
             offset = replace(offset, known=False)
             faults.append(_changing(name, change, motion.start_ns))
+            jumps += [] if change.is_rate else faults[-1:]
         offsets.append(offset)
-    return ClockReport(tuple(offsets), tuple(faults))
+    return ClockReport(tuple(offsets), tuple(faults), tuple(jumps))
 
 
 def beyond_state(offset: ClockOffset) -> bool:
-    """Whether an offset is known, and larger than what is estimated as a state."""
-    return offset.known and abs(offset.lag_s) > STATE_S
+    """Whether an offset is known, and clearly larger than what is estimated as a state."""
+    return offset.known and abs(offset.lag_s) - offset.sigma_s > STATE_S
 
 
 def apply_offsets(session: Session, report: ClockReport) -> tuple[Session, ClockReport]:

@@ -56,7 +56,9 @@ def _field(facts: Facts) -> Iterator[Finding]:
             return
     if not 0.3 * low < size < 3.0 * high:
         text = f"median |field| {size:.4g} uT, expected {near}"
-        yield Finding("magnetometer", text, "calibrate its hard iron, or check the unit")
+        iron = turning is not None and 0.3 * low < turning < 3.0 * high  # the offset is estimated
+        verdict = "good" if iron else "doubtful"
+        yield Finding("magnetometer", text, "calibrate its hard iron, or check the unit", verdict=verdict)
     yield from _field_direction(facts, size)
     for first, last in repeats(stream.field_ut):
         seconds = (stream.t_ns[last] - stream.t_ns[first]) / NS

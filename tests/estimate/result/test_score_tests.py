@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planted_faults import focal_length
 from sessions import recorded, shifted, with_gnss, with_imu
 
+import smartnav_graph as sn
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result import summary
 from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
@@ -72,6 +74,14 @@ def test_a_wrong_lever_arm(eight, found):
 def test_a_wrong_gyro_scale(eight, found):
     wrong = with_imu(eight, gyro=eight.imu.gyro * [1.0, 1.0, 1.03])
     assert_near(found(wrong)["gyro scale", "z"], 0.03)
+
+
+def test_a_wrong_focal_length(found):
+    """Half a minute in a room, whose turns and accelerations the inertial data know."""
+    room = sn.load("gtsam-euroc")
+    right, wrong = (found(focal_length(factor)(room, np.random.default_rng(0))) for factor in (1.0, 1.05))
+    assert abs(right["focal length", ""].value) < 0.01
+    assert_near(wrong["focal length", ""], 0.05)
 
 
 def test_readings_that_are_only_noise_have_no_scale(eight, found):

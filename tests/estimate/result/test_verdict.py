@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import smartnav_graph as sn
+from smartnav_graph.estimate.result import verdict as verdicts
+from smartnav_graph.estimate.result.score_tests import SensorError
 from smartnav_graph.estimate.result.verdict import interpolated
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account
+from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
+from smartnav_graph.session.health.clocks import ClockReport
+from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.simulation.degrade import Degrade, degrade
 
 NS = 10**9
@@ -72,6 +79,49 @@ def test_faults_are_not_good(drive, fault):
     change, level, word = FAULTS[fault]
     found, text = verdict(change(drive))
     assert found != "good" and (level is None or found == level) and word in text, text
+
+
+@pytest.mark.parametrize(("kept", "contrary", "refused", "word"), [(80, 20, "", "20 %"), (0, 9, "why", "none is used")])
+def test_images_that_contradict_the_other_sensors_count(monkeypatch, kept, contrary, refused, word):
+    reasons = {**dict.fromkeys(REASONS, 0), REASONS[IN_USE]: kept, REASONS[CONTRARY]: contrary}
+    monkeypatch.setattr(verdicts, "pair_account", lambda *_: Account(reasons, 0, refused))
+    inputs = SimpleNamespace(solved=SimpleNamespace(problem=SimpleNamespace(builders=()), pass_state=None))
+    assert word in next(iter(verdicts._images(inputs))).text
+    reasons |= {REASONS[IN_USE]: 100, REASONS[CONTRARY]: 5}
+    monkeypatch.setattr(verdicts, "pair_account", lambda *_: Account(reasons, 0, ""))
+    assert not list(verdicts._images(inputs))
+
+
+def test_a_jump_of_the_stamps_counts_unless_the_solution_shows_none():
+    jump = Finding("gnss", "stamps jump", size=9.0)
+    clocks, session = ClockReport(faults=(jump,), jumps=(jump,)), SimpleNamespace(t0_ns=0)
+    solved = SimpleNamespace(problem=SimpleNamespace(session=session, findings=(jump,), clocks=clocks))
+
+    def reasons(value: float, sigma: float, chi2: float = 1.0) -> list[str]:
+        errors = [SensorError("gnss", "clock jump", value=value, sigma=sigma), SensorError("gnss", "clock", value=9.0)]
+        fit = SimpleNamespace(per_dof=lambda: {"gnss": chi2, "imu": 1.0})
+        return [one.text for one in verdicts._recording(SimpleNamespace(solved=solved, errors=errors, fit=fit))]
+
+    assert reasons(0.1, 0.1) == []
+    for shown in (reasons(3.0, 0.1), reasons(0.1, 2.0), reasons(0.1, 0.1, chi2=3.0)):  # s, s, 1
+        assert shown == ["stamps jump"]
+
+
+def test_fixes_of_two_places_in_turns_contradict_each_other():
+    def reasons(residual: np.ndarray) -> list[str]:
+        return [
+            one.text for one in verdicts._two_places(SimpleNamespace(solved=SimpleNamespace(fixes=fixes(residual))))
+        ]
+
+    def fixes(residual: np.ndarray) -> dict[str, SimpleNamespace]:
+        return {"gnss": SimpleNamespace(residual=residual)}
+
+    rng = np.random.default_rng(0)
+    noise, second = rng.normal(0.0, 3.0, (60, 3)), np.arange(60)[:, None] % 2
+    assert not reasons(noise) and not reasons(rng.uniform(-3.0, 3.0, (60, 3))) and not reasons(noise[:30])
+    assert not reasons(noise + np.where(np.arange(60)[:, None] % 10, 0.0, 40.0))  # outliers
+    assert "fixes are alternately of two places, 2" in reasons(noise + second * [15.0, 20.0, 0.0])[0]
+    assert "heights of the fixes" in reasons(noise + second * [0.0, 0.0, 47.0])[0]
 
 
 def test_withheld_fixes_are_compared_with_the_line_and_the_cubic_between_the_kept_ones():
