@@ -11,9 +11,8 @@ doubtful : the result may be wrong by more than its covariance says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -36,8 +35,8 @@ from smartnav_graph.session.health.clocks import STATE_S
 LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
 MISFIT, EXCLUDED = 2.0, 6.0
-# One of sensors that agree, and one where residuals are no less than their sigmas.
-FITS, NO_LESS = 1.5, 0.8
+# One where residuals are no less than their sigmas.
+NO_LESS = 0.8
 # Sensors under a redescending loss: their tails are expected.
 ROBUST = (*IMAGES, "magnetometer")
 # How rarely a sensor that fits reaches its chi-square.
@@ -121,11 +120,6 @@ class VerdictInputs:
     fit: Chi2
     withheld: Mapping[str, Withheld]
     together: bool
-
-    @cached_property
-    def errors(self) -> Sequence[SensorError]:
-        """Errors of sensors without a state, where the states were solved together."""
-        return sensor_errors(self.solved) if self.together else ()
 
     @property
     def on_foot(self) -> bool:
@@ -226,7 +220,7 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
     worst: dict[str, SensorError] = {}
     misfit = inputs.fit.per_dof()
     session = inputs.solved.problem.session
-    for error in inputs.errors:
+    for error in sensor_errors(inputs.solved) if inputs.together else ():
         limit = LIMITS[error.kind]
         error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
@@ -341,20 +335,10 @@ def _recording(inputs: VerdictInputs) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
     t0 = inputs.solved.problem.session.t0_ns
     for finding in inputs.solved.problem.findings:
-        jump = finding in inputs.solved.problem.clocks.jumps
-        if finding.verdict == LEVELS[0] or (jump and _keeps_time(inputs, finding.where)):
+        if finding.verdict == LEVELS[0]:
             continue
         start, end = (None if t_ns is None else (t_ns - t0) / NS for t_ns in (finding.start_ns, finding.end_ns))
         yield Reason(finding.verdict, finding.where, finding.text, finding.remedy, finding.size, start, end)
-
-
-def _keeps_time(inputs: VerdictInputs, sensor: str) -> bool:
-    """Whether the solution shows that the clock of a sensor does not jump: where a motion is repeated, its parts are
-    alike, and stamps that fit one fit another."""
-    jumps = [error for error in inputs.errors if (error.sensor, error.kind) == (sensor, "clock jump")]
-    misfit = inputs.fit.per_dof()
-    fits = all(misfit.get(name, np.inf) < FITS for name in (sensor, "imu"))
-    return fits and bool(jumps) and all(abs(j.value) + 3.0 * j.sigma < STATE_S for j in jumps)
 
 
 def _solver(inputs: VerdictInputs) -> Iterator[Reason]:

@@ -28,13 +28,11 @@ _SENSORS = ("gnss", "pose_fixes")
 class ClockReport:
     """What a comparison of the position sensors with the inertial data finds.
 
-    offsets : of each sensor that could be compared; faults : of axes and of the stamps within a stream; jumps : those
-    of the faults that are jumps of the stamps
+    offsets : of each sensor that could be compared; faults : of axes and of the stamps within a stream
     """
 
     offsets: tuple[ClockOffset, ...] = ()
     faults: tuple[Finding, ...] = ()
-    jumps: tuple[Finding, ...] = ()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -62,7 +60,7 @@ def compare_clocks(session: Session) -> ClockReport:
         name: FixTrack.of(stream.t_ns, session.nav_position(stream), motion.start_ns)
         for name, stream in streams.items()
     }
-    offsets, faults, jumps = list[ClockOffset](), list[Finding](), list[Finding]()
+    offsets, faults = [], []
     for name, track in tracks.items():
         offset = find_clock_offset(name, motion, track)
         if offset is None:
@@ -74,9 +72,8 @@ def compare_clocks(session: Session) -> ClockReport:
         elif change := find_clock_change(motion, track, lag_s):
             offset = replace(offset, known=False)
             faults.append(_changing(name, change, motion.start_ns))
-            jumps += [] if change.is_rate else faults[-1:]
         offsets.append(offset)
-    return ClockReport(tuple(offsets), tuple(faults), tuple(jumps))
+    return ClockReport(tuple(offsets), tuple(faults))
 
 
 def beyond_state(offset: ClockOffset) -> bool:

@@ -10,12 +10,9 @@ import pytest
 
 import smartnav_graph as sn
 from smartnav_graph.estimate.result import verdict as verdicts
-from smartnav_graph.estimate.result.score_tests import SensorError
 from smartnav_graph.estimate.result.verdict import interpolated
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
-from smartnav_graph.session.health.clocks import ClockReport
-from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.simulation.degrade import Degrade, degrade
 
 NS = 10**9
@@ -90,21 +87,6 @@ def test_images_that_contradict_the_other_sensors_count(monkeypatch, kept, contr
     reasons |= {REASONS[IN_USE]: 100, REASONS[CONTRARY]: 5}
     monkeypatch.setattr(verdicts, "pair_account", lambda *_: Account(reasons, 0, ""))
     assert not list(verdicts._images(inputs))
-
-
-def test_a_jump_of_the_stamps_counts_unless_the_solution_shows_none():
-    jump = Finding("gnss", "stamps jump", size=9.0)
-    clocks, session = ClockReport(faults=(jump,), jumps=(jump,)), SimpleNamespace(t0_ns=0)
-    solved = SimpleNamespace(problem=SimpleNamespace(session=session, findings=(jump,), clocks=clocks))
-
-    def reasons(value: float, sigma: float, chi2: float = 1.0) -> list[str]:
-        errors = [SensorError("gnss", "clock jump", value=value, sigma=sigma), SensorError("gnss", "clock", value=9.0)]
-        fit = SimpleNamespace(per_dof=lambda: {"gnss": chi2, "imu": 1.0})
-        return [one.text for one in verdicts._recording(SimpleNamespace(solved=solved, errors=errors, fit=fit))]
-
-    assert reasons(0.1, 0.1) == []
-    for shown in (reasons(3.0, 0.1), reasons(0.1, 2.0), reasons(0.1, 0.1, chi2=3.0)):  # s, s, 1
-        assert shown == ["stamps jump"]
 
 
 def test_fixes_of_two_places_in_turns_contradict_each_other():
