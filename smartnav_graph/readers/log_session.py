@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,10 +25,12 @@ SLOWEST_S = 0.3  # between inertial samples: slower, steps and turns are not see
 
 @dataclass
 class LogParts:
-    """Streams of a log while it is read: file and columns by name, and what was left out of each."""
+    """Streams of a log while it is read: file and columns by name, and what was left out of each; refused : why there
+    are no inertial data."""
 
     tables: dict[str, tuple[Path, Table]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    refused: SessionError | None = None
 
     def add(self, stream: str, file: Path, table: Table, counts: Mapping[str, int] | None = None) -> None:
         """One more stream; counts of rows left out, by reason."""
@@ -51,6 +53,22 @@ class LogParts:
             self.count("imu", {reason: len(table["t_ns"])})
         else:
             self.add("imu", gyro.file, table, counts)
+
+    def add_inertial(
+        self, file: Path, gyro: Samples | None, accel: Samples | None, seen: Iterable[str], *, wanted: bool = False
+    ) -> None:
+        """As `add_imu`, of what there is: without one of them inertial data are left out where there are fixes, and
+        `log_session` raises an error where there are none. `seen` : what the log has; wanted : both have to be there.
+        """
+        if gyro is not None and accel is not None:
+            self.add_imu(gyro, accel)
+        elif gyro is not None:
+            self.count("imu", {"of the gyroscope left out: there is no accelerometer with gravity": len(gyro)})
+            self.refused = no_accelerometer(file, seen)
+        elif accel is not None or wanted:
+            count = 0 if accel is None else len(accel)
+            self.count("imu", {"of the accelerometer left out: there is no gyroscope": count})
+            self.refused = no_gyro(file, seen)
 
     def add_magnetometer(self, field_ut: Samples) -> None:
         """The stream ``magnetometer`` of flux density uT."""
@@ -93,8 +111,12 @@ def log_session(
     Raises
     ------
     SessionError
-        No stream, or a faulty one.
+        No stream, or a faulty one; a part of the inertial data without fixes.
     """
+    if parts.refused is not None and "gnss" not in parts.tables:
+        raise parts.refused
+    if parts.refused is not None:
+        _log.warning("%s; fixes only are read", parts.refused)
     if not parts.tables:
         left_out = "; ".join(f"{n} rows {why}" for counts in parts.counts.values() for why, n in counts.items())
         what = f"holds no stream ({left_out})" if left_out else "holds no stream"
@@ -111,3 +133,16 @@ def log_session(
     names = [*parts.counts, *(stream for stream in session.dropped if stream not in parts.counts)]
     dropped = {stream: {**parts.counts.get(stream, {}), **session.dropped.get(stream, {})} for stream in names}
     return session.replace(dropped={stream: counts for stream, counts in dropped.items() if counts})
+
+
+def no_gyro(file: Path, seen: Iterable[str]) -> SessionError:
+    """The error of a log without angular rate."""
+    found = f"holds no gyroscope (it has {', '.join(seen) or 'nothing that is known'})"
+    return SessionError(file, found, "gyroscope and accelerometer", "switch the gyroscope on in the app", stream="imu")
+
+
+def no_accelerometer(file: Path, seen: Iterable[str]) -> SessionError:
+    """The error of a log without specific force."""
+    found = f"holds no accelerometer with gravity (it has {', '.join(seen) or 'nothing that is known'})"
+    remedy = "switch on the accelerometer with gravity, or gravity beside the linear acceleration"
+    return SessionError(file, found, "gyroscope and accelerometer", remedy, stream="imu")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -207,16 +206,3 @@ def fixes_of(channels: Channels, t_ns: Times, rows: Mask | None = None) -> Logge
         speed_sigma=kept("speed_sigma"),
         course_sigma=kept("course_sigma"),
     )
-
-
-def no_gyro(file: Path, seen: Iterable[str]) -> SessionError:
-    """The error of a log without angular rate."""
-    found = f"holds no gyroscope (it has {', '.join(seen) or 'nothing that is known'})"
-    return SessionError(file, found, "gyroscope and accelerometer", "switch the gyroscope on in the app", stream="imu")
-
-
-def no_accelerometer(file: Path, seen: Iterable[str]) -> SessionError:
-    """The error of a log without specific force."""
-    found = f"holds no accelerometer with gravity (it has {', '.join(seen) or 'nothing that is known'})"
-    remedy = "switch on the accelerometer with gravity, or gravity beside the linear acceleration"
-    return SessionError(file, found, "gyroscope and accelerometer", remedy, stream="imu")

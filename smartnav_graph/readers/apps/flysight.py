@@ -15,9 +15,10 @@ import numpy as np
 from smartnav_graph.core.arrays import Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, utc_from_gps
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro, read_vector
+from smartnav_graph.readers.apps.channels import read_vector
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
+from smartnav_graph.readers.samples import Samples
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.text import TextTable, read_bytes
 from smartnav_graph.readers.text_lines import head_of, in_utf8
@@ -159,13 +160,16 @@ def _add_sensors(log: _Records, line: tuple[int, float, int], parts: LogParts, r
     if "IMU" in log.rows:
         table = log.table("IMU")
         t_ns = stamps(table)
-        if not {"wx", "wy", "wz"} <= set(table.cells):
-            raise no_gyro(log.path, table.cells)
-        if not {"ax", "ay", "az"} <= set(table.cells):
-            raise no_accelerometer(log.path, table.cells)
-        gyro = table.floats("wx", "wy", "wz") * log.factor("IMU", "wx", ANGULAR_RATE, "deg/s")
-        accel = table.floats("ax", "ay", "az") * log.factor("IMU", "ax", ACCELERATION, "g")
-        parts.add_imu(read_vector(table, t_ns, gyro, repairs), read_vector(table, t_ns, accel, repairs))
+
+        def vector(letter: str, units: dict[str, float], unit: str) -> Samples | None:
+            names = [f"{letter}{axis}" for axis in "xyz"]
+            if not set(names) <= set(table.cells):
+                return None
+            values = table.floats(*names) * log.factor("IMU", names[0], units, unit)
+            return read_vector(table, t_ns, values, repairs)
+
+        gyro, accel = vector("w", ANGULAR_RATE, "deg/s"), vector("a", ACCELERATION, "g")
+        parts.add_inertial(log.path, gyro, accel, table.cells)
         parts.count("imu", {"cut at the end of the file left out": log.torn})
         if "temperature" in table.cells:
             parts.add_single(

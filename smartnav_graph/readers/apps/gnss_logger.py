@@ -16,7 +16,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Mask, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro, read_vector
+from smartnav_graph.readers.apps.channels import read_vector
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples, clock_offset
@@ -114,17 +114,12 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     every = {role: _vector(log, kinds, offset, repairs) for role, kinds in _SENSORS.items()}
     vectors = {role: samples for role, samples in every.items() if samples is not None}
     accel, gyro = vectors.get("accel"), vectors.get("gyro")
-    if accel is not None and gyro is not None:
-        parts.add_imu(gyro, accel)
-    elif accel is not None:
-        raise no_gyro(path, log.rows)
-    elif gyro is not None:
-        raise no_accelerometer(path, log.rows)
+    parts.add_inertial(path, gyro, accel, log.rows)
     if "field" in vectors:
         parts.add_magnetometer(vectors["field"])
     if fixes is not None:
         _add_fixes(parts, fixes, offset)
-    if not parts.tables:
+    if not parts.tables and parts.refused is None:
         seen = f"holds no fixes and no inertial data (it has {', '.join(log.others) or 'no records'})"
         raise SessionError(path, seen, "records of Fix, Accel and Gyro", "switch them on in the app")
     parts.count("gnss" if "gnss" in parts.tables else "imu", {"cut at the end of the file left out": log.torn})

@@ -17,7 +17,6 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_seconds
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro
 from smartnav_graph.readers.apps.gpmf import Item, is_gpmf, items_in, payloads
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
@@ -150,18 +149,14 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     streams, device = _parse(path, found)
     gps = streams.get("GPS9", streams.get("GPS5"))
     accel, gyro = streams.get("ACCL"), streams.get("GYRO")
-    if gyro is None and (accel is not None or gps is None):
-        raise no_gyro(path, streams)
-    if accel is None and gyro is not None:
-        raise no_accelerometer(path, streams)
     offset = _to_unix(gps, film, "GPS9" in streams)
     parts = LogParts()
 
     def samples(stream: _Stream) -> Samples:
         return in_time_order(path, _steady(stream, _starts(stream, film, gps)) + (offset or 0), stream.rows(), repairs)
 
-    if accel is not None and gyro is not None:
-        parts.add_imu(samples(gyro), samples(accel))
+    rate, force = (None if stream is None else samples(stream) for stream in (gyro, accel))
+    parts.add_inertial(path, rate, force, streams, wanted=gps is None)
     if "MAGN" in streams:
         parts.add_magnetometer(samples(streams["MAGN"]))
     if gps is not None:

@@ -12,7 +12,6 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.mat5 import Matrix, ObjectFile, read_objects, variable_names
@@ -77,12 +76,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
             vectors[name] = in_time_order(path, t_ns, np.stack([columns[axis] for axis in "xyz"], axis=-1), repairs)
     parts = LogParts()
     accel, gyro = vectors.get("Acceleration"), vectors.get("AngularVelocity")
-    if accel is not None and gyro is None:
-        raise no_gyro(path, file.variables)
-    if gyro is not None and accel is None:
-        raise no_accelerometer(path, file.variables)
-    if accel is not None and gyro is not None:
-        parts.add_imu(gyro, accel)
+    parts.add_inertial(path, gyro, accel, file.variables)
     if "MagneticField" in vectors:
         parts.add_magnetometer(vectors["MagneticField"])
     if "Position" in tables:

@@ -17,7 +17,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_text
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro, read_vector
+from smartnav_graph.readers.apps.channels import read_vector
 from smartnav_graph.readers.apps.excel import is_excel, read_sheets, sheet_names
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
@@ -131,12 +131,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     accel, gyro = vectors.get("accel"), vectors.get("gyro")
     if accel is None and "linear" in vectors and "gravity" in vectors:
         accel = summed(vectors["linear"], vectors["gravity"])
-    if accel is not None and gyro is not None:
-        parts.add_imu(gyro, accel)
-    elif gyro is not None:
-        raise no_accelerometer(path, tables)
-    elif accel is not None or "linear" in vectors or not parts.tables:
-        raise no_gyro(path, tables)
+    parts.add_inertial(path, gyro, accel, tables, wanted="linear" in vectors or not parts.tables)
     return log_session(parts, repairs, name=_device(about), epoch="unix" if start_ns is not None else "unknown")
 
 

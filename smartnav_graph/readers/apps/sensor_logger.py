@@ -17,7 +17,6 @@ import numpy as np
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
-from smartnav_graph.readers.apps.channels import no_accelerometer, no_gyro
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples, in_time_order, summed
@@ -167,12 +166,7 @@ def _samples(table: TextTable, names: tuple[str, ...], repairs: tuple[str, ...])
 def _add_imu(path: Path, parts: LogParts, samples: Mapping[str, Samples], about: Mapping[str, str]) -> None:
     gyro = samples.get("Gyroscope") or samples.get("GyroscopeUncalibrated")
     accel = _specific_force(path, samples, about)
-    if accel is not None and gyro is not None:
-        parts.add_imu(gyro, accel)
-    elif accel is not None or ("Accelerometer" in samples and gyro is None):
-        raise no_gyro(path, samples)
-    elif gyro is not None:
-        raise no_accelerometer(path, samples)
+    parts.add_inertial(path, gyro, accel, samples, wanted="Accelerometer" in samples)
 
 
 def _specific_force(path: Path, samples: Mapping[str, Samples], about: Mapping[str, str]) -> Samples | None:

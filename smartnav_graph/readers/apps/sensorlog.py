@@ -21,8 +21,6 @@ from smartnav_graph.readers.apps.channels import (
     channels_of,
     fixes_of,
     force_of,
-    no_accelerometer,
-    no_gyro,
     read_vector,
 )
 from smartnav_graph.readers.log_session import LogParts, log_session
@@ -116,12 +114,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     clock, parts = _Clock(table), LogParts()
     channels = channels_of(table)
     force, gyro = _force(channels, clock, repairs), _gyro(channels, clock, repairs)
-    if gyro is None and force is not None:
-        raise no_gyro(path, [*channels.vectors, *channels.scalars])
-    if gyro is not None and force is None:
-        raise no_accelerometer(path, [*channels.vectors, *channels.scalars])
-    if gyro is not None and force is not None:
-        parts.add_imu(gyro, force)
+    parts.add_inertial(path, gyro, force, [*channels.vectors, *channels.scalars])
     _add_field(channels, clock, parts, repairs)
     if channels.has("pressure"):
         t_ns, rows = clock.of("altimeter")

@@ -21,8 +21,6 @@ from smartnav_graph.readers.apps.channels import (
     channels_of,
     fixes_of,
     force_of,
-    no_accelerometer,
-    no_gyro,
     read_vector,
 )
 from smartnav_graph.readers.log_session import LogParts, log_session
@@ -199,14 +197,8 @@ def _read(app: WideApp, source: str, repairs: tuple[str, ...]) -> Session:
             parts.add_single("barometer", "pressure_hpa", read_vector(channels.table, t_ns, pressure, repairs))
         if channels.has("lat", "lon"):
             parts.add_fixes(channels.table.path, fixes_of(channels, t_ns), channels.table.skipped)
-    if gyro is None and force is not None:
-        raise no_gyro(path, seen)
-    if gyro is not None and force is None:
-        raise no_accelerometer(path, seen)
-    if gyro is not None and force is not None:
-        parts.add_imu(read_vector(gyro[0].table, gyro[1], gyro[0].vector("gyro"), repairs), force)
-    if not parts.tables:
-        raise no_gyro(path, seen)
+    rate = None if gyro is None else read_vector(gyro[0].table, gyro[1], gyro[0].vector("gyro"), repairs)
+    parts.add_inertial(path, rate, force, seen, wanted=not parts.tables)
     return log_session(parts, repairs, name=app.device, epoch=epochs.pop() if len(epochs) == 1 else "unknown")
 
 

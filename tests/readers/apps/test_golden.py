@@ -90,14 +90,18 @@ def test_sensor_logger_json(tmp_path, nested):
 
 
 def test_sensor_logger_without_gravity_or_gyro_says_so(tmp_path):
-    folder = sensor_logger(tmp_path / "x", total=False)
-    (folder / "Gravity.csv").unlink()
-    with pytest.raises(SessionError, match=r"holds no accelerometer with gravity .* switch on the accelerometer with"):
-        readers.read(folder)
-    folder = sensor_logger(tmp_path / "y")
-    (folder / "Gyroscope.csv").unlink()
-    with pytest.raises(SessionError, match=r"holds no gyroscope .* switch the gyroscope on"):
-        readers.read(folder)
+    """Refused where there is nothing else; with fixes these alone are read, and the rest is counted."""
+    whole = (("x", "Gravity", "accelerometer with gravity", False), ("y", "Gyroscope", "gyroscope", True))
+    for name, missing, found, total in whole:
+        folder = sensor_logger(tmp_path / name, total=total)
+        (folder / f"{missing}.csv").unlink()
+        session = readers.read(folder)
+        assert session.imu is None and len(session.gnss) == 4
+        (reason,) = session.dropped["imu"]
+        assert reason.endswith(f"left out: there is no {found}")
+        (folder / "Location.csv").unlink()
+        with pytest.raises(SessionError, match=f"holds no {found} .* switch"):
+            readers.read(folder)
 
 
 @pytest.mark.parametrize(("separator", "comma"), [(",", False), (";", True), ("\t", False), ("\t", True)])
@@ -111,8 +115,11 @@ def test_phyphox_in_other_languages_and_with_decimal_commas(tmp_path, separator,
 
 
 def test_phyphox_without_gravity_is_refused(tmp_path):
+    folder = phyphox(tmp_path / "x", gravity=False)
+    assert "there is no accelerometer with gravity" in str(readers.read(folder).dropped["imu"])
+    (folder / "Location.csv").unlink()
     with pytest.raises(SessionError, match="holds no accelerometer with gravity"):
-        readers.read(phyphox(tmp_path / "x", gravity=False))
+        readers.read(folder)
 
 
 def test_phyphox_excel(tmp_path):
@@ -190,8 +197,10 @@ def test_a_log_in_g_without_unit_is_known_by_its_size(tmp_path):
 
 
 def test_matlab_without_gyro_is_refused_and_foreign_files_are_not_recognised(tmp_path):
-    with pytest.raises(SessionError, match=r"x.mat: holds no gyroscope \(it has Acceleration, Position\)"):
-        readers.read(matlab_mobile(tmp_path / "x.mat", tables=("Acceleration", "Position")))
+    with pytest.raises(SessionError, match=r"x.mat: holds no gyroscope \(it has Acceleration\)"):
+        readers.read(matlab_mobile(tmp_path / "x.mat", tables=("Acceleration",)))
+    fixes_only = readers.read(matlab_mobile(tmp_path / "x.mat", tables=("Acceleration", "Position")))
+    assert fixes_only.imu is None and "there is no gyroscope" in str(fixes_only.dropped["imu"])
     good = (tmp_path / "x.mat").read_bytes()
     foreign = {"cut": good[:700], "hdf": b"MATLAB 7.3 MAT-file".ljust(600, b"\x89"), "zero": good[:128] + bytes(400)}
     for name, data in foreign.items():
