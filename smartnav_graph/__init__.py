@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from smartnav_graph.output.run_folder import read_run as read_run
     from smartnav_graph.output.run_folder import write_run as write_run
     from smartnav_graph.readers import load as load
+    from smartnav_graph.readers.join import join as join
     from smartnav_graph.readers.reference import load_reference as load_reference
     from smartnav_graph.session.calibration.model import Calibration as Calibration
     from smartnav_graph.session.folder import save as save
@@ -69,6 +70,7 @@ _MODULES = {
     "SmartnavError": "core.errors",
     "Solution": "graph.solution",
     "evaluate": "evaluation",
+    "join": "readers.join",
     "load": "readers",
     "load_reference": "readers.reference",
     "read_run": "output.run_folder",

@@ -9,10 +9,12 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.frames import LocalFrame, axis_vector
 from smartnav_graph.core.timebase import NS, interpolate, ns_from_seconds, seconds_since
-from smartnav_graph.readers.fixes import first_fix
+from smartnav_graph.readers.fixes import LoggedFixes, first_fix
+from smartnav_graph.readers.samples import Samples
 
 COHERENCE = 0.5  # of horizontal force and the acceleration of the fixes, below which forward is not known
 LEAST_SPEED = 2.0  # m/s: slower, a hand moves the device more than its carrier does
+LEAST_TURN = 2.0  # rad of course, in all, that shows the sign of a turn
 _STEP_S = 1.0
 
 
@@ -101,3 +103,27 @@ def _means(t_ns: Times, values: Floats, grid: Times) -> Floats:
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     count = np.diff(edge)[:, None]
     return np.where(count > 0, np.diff(total[edge], axis=0) / np.maximum(count, 1), np.nan)
+
+
+def sign_by_turn(force: Samples, gyro: Samples, fixes: LoggedFixes) -> float:
+    """1 where the force (n, 3) points up, -1 where it points down, by the turns about it; zero where they say nothing.
+
+    Between fixes the course turns by as much as the gyroscope shows about up; about down it is the opposite.
+    """
+    if fixes.course is None or fixes.speed is None:
+        return 0.0
+    size = np.linalg.norm(np.median(force.values, axis=0))
+    moving = np.isfinite(fixes.course) & (fixes.course >= 0.0) & (np.nan_to_num(fixes.speed) > LEAST_SPEED)
+    moving &= (fixes.t_ns > gyro.t_ns[0]) & (fixes.t_ns < gyro.t_ns[-1])
+    if not size > 0.0 or moving.sum() < 10:
+        return 0.0
+    rate = gyro.values @ (np.median(force.values, axis=0) / size)
+    step = np.diff(seconds_since(gyro.t_ns, int(gyro.t_ns[0])))
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
+    at = fixes.t_ns[moving]
+    near = np.diff(at) < 3 * NS
+    by_gyro = np.diff(interpolate(at, gyro.t_ns, turned))[near]
+    by_course = -np.diff(np.unwrap(np.radians(fixes.course[moving])))[near]
+    product, squares = float(by_gyro @ by_course), float(np.sqrt((by_gyro @ by_gyro) * (by_course @ by_course)))
+    clear = np.abs(by_course).sum() > LEAST_TURN and abs(product) > COHERENCE * squares
+    return float(np.sign(product)) if clear else 0.0

@@ -20,6 +20,7 @@ from smartnav_graph.session import repair
 from smartnav_graph.session.streams import Imu, Magnetometer
 
 GAP_S = 0.05  # no reading is interpolated across a longer step, unless the sensor is slower
+SLOWER = 1.5  # times the rate of the accelerometer: a gyroscope so fast has forces that were not measured
 SAME_STAMP_NS = 10_000  # stamps closer than this count as one: readings change less in between than they are resolved
 
 Counts = Mapping[str, int]
@@ -128,6 +129,8 @@ def inertial_table(gyro: Samples, accel: Samples) -> tuple[Table, dict[str, int]
     t_ns = gyro.t_ns[known]
     outside = (accel.t_ns < t_ns[0]) | (accel.t_ns > t_ns[-1])
     apart = np.abs(accel.t_ns[nearest(t_ns, accel.t_ns)] - t_ns) > SAME_STAMP_NS
+    if SLOWER * accel.rate_hz > gyro.rate_hz:  # interpolation loses nothing
+        apart[:] = False
     counts = {f"of the gyro {reason}": count for reason, count in gyro.counts.items()}
     counts |= {f"of the accelerometer {reason}": count for reason, count in accel.counts.items()}
     counts |= {

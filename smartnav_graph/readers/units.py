@@ -34,6 +34,7 @@ TIME_NS |= dict.fromkeys(("ms", "milli", "millis", "millisecond", "milliseconds"
 TIME_NS |= dict.fromkeys(("us", "micros", "microsecond", "microseconds"), NS // 10**6)
 TIME_NS |= dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), 1) | {"min": 60 * NS, "h": 3600 * NS}
 
+_LOST = {"?t": "ut", "m/s?": "m/s2", "?/s": "°/s", "?": "°"}
 _IN_BRACKETS = re.compile(r"[(\[]\s*([^)\]]*?)\s*[)\]]")
 _SAME = str.maketrans({"²": "2", "μ": "u", "µ": "u", "−": "-", "·": "*", "º": "°", "⁻": "-", "¹": "1"})
 
@@ -44,9 +45,11 @@ def plain_heading(name: str) -> str:
 
 
 def unit_in(heading: str) -> str:
-    """What a heading has in its last brackets, plain; empty without brackets."""
+    """What a heading has in its last brackets, plain; empty without brackets. A sign that no code page could write, and
+    that became a question mark, is that of micro, of a square or of degrees."""
     found = _IN_BRACKETS.findall(heading)
-    return plain_heading(found[-1]) if found else ""
+    unit = plain_heading(found[-1]) if found else ""
+    return _LOST.get(unit.replace("\ufffd", "?"), unit)
 
 
 def quantity_in(heading: str) -> str:

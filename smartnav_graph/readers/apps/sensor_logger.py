@@ -1,4 +1,5 @@
-"""Sensor Logger (Kelvin Choi; Android and iOS): folder or archive of CSV files, one a sensor, or one JSON file.
+"""Sensor Logger (Kelvin Choi; Android and iOS): folder or archive of CSV files, one a sensor, or one file of all, JSON
+or CSV, with a column ``sensor`` or with columns such as Gyroscope_x.
 
 Units and signs as its page UNITS.md and CROSSPLATFORM.md say: m/s^2, rad/s, uT, mbar; Unix nanoseconds. Android writes
 the acceleration with gravity to TotalAcceleration, without it to Accelerometer; iOS writes only the latter, and both
@@ -17,6 +18,7 @@ import numpy as np
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.readers.axes import sign_by_turn
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples, in_time_order, summed
@@ -49,7 +51,7 @@ def _is_ours(file: Path) -> bool:
 def _is_json(path: Path) -> bool:
     if path.suffix.lower() != ".json" or not path.is_file():
         return False
-    head = head_of(path).lower().replace(" ", "")
+    head = "".join(head_of(path).lower().split())
     records = '"seconds_elapsed"' in head or '"values"' in head
     return records and any(f'{key}:"{name.lower()}"' in head for key in ('"sensor"', '"name"') for name in _SENSORS)
 
@@ -57,6 +59,8 @@ def _is_json(path: Path) -> bool:
 def _matches(source: str) -> bool:
     try:
         path = Path(source)
+        if path.is_file() and path.suffix.lower() in (".csv", ".txt"):
+            return bool(_combined_columns(heading_of(path)))
         return _is_json(path) or any(_is_ours(file) for name, file in _csv_files(path).items() if name != _METADATA)
     except (OSError, ValueError):  # ValueError: a zero byte in the name
         return False
@@ -64,8 +68,10 @@ def _matches(source: str) -> bool:
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
     path = Path(source)
-    if path.is_file():
+    if _is_json(path):
         tables, about = _of_json(path)
+    elif path.is_file():
+        tables, about = _of_combined(path), {}
     else:
         tables = {}
         for name, file in _csv_files(path).items():
@@ -74,7 +80,6 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         about = _metadata(path)
     parts = LogParts()
     samples = {name: _vector(table, repairs) for name, table in tables.items() if {"x", "y", "z"} <= set(table.cells)}
-    _add_imu(path, parts, samples, about)
     if "Magnetometer" in samples:
         parts.add_magnetometer(samples["Magnetometer"])
     elif "MagnetometerUncalibrated" in samples:
@@ -83,10 +88,53 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         table = tables["Barometer"]
         parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
     location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
-    if location is not None:
-        parts.add_fixes(location.path, _fixes(location), location.skipped)
+    fixes = None if location is None else _fixes(location)
+    if location is not None and fixes is not None:
+        parts.add_fixes(location.path, fixes, location.skipped)
+    _add_imu(path, parts, samples, about, fixes)
     device = about.get("device name") or about.get("devicename") or about.get("platform") or "Sensor Logger"
     return log_session(parts, repairs, name=device, epoch="unix")
+
+
+def _combined_columns(heading: list[str]) -> dict[str, dict[str, str]]:
+    """Columns of a file of all sensors, by sensor: heading to name in the sensor's own file. Of a file with a column
+    `sensor`, under its name.  Empty for other files."""
+    names = {name.lower(): name for name in heading}
+    if not {"time", "seconds_elapsed"} <= set(names):
+        return {}
+    stamp = names["time"]
+    if "sensor" in names:
+        return {"sensor": {name: name.lower() for name in heading}}
+    found: dict[str, dict[str, str]] = {}
+    for name in heading:
+        sensor, _, own = name.replace(".", "_").replace(" ", "_").partition("_")
+        known = next((known for known in _SENSORS if known.lower() == sensor.lower()), None)
+        if known is not None and own:
+            found.setdefault(known, {stamp: "time"})[name] = own.lower()
+    return found
+
+
+def _of_combined(path: Path) -> dict[str, TextTable]:
+    """Tables by sensor of one CSV file: rows with readings of a sensor, or rows of the sensor that they name."""
+    table = read_text(path, whole=True)
+    columns = _combined_columns(list(table.cells))
+    tables: dict[str, TextTable] = {}
+    if "sensor" in columns:
+        cells = {own: table.cells[name] for name, own in columns["sensor"].items()}
+        whole = TextTable(path, cells, table.skipped)
+        present = {str(name).lower() for name in set(whole.texts("sensor"))}
+        for sensor in _SENSORS:
+            if sensor.lower() in present:
+                rows = whole.rows(np.array([str(name).lower() == sensor.lower() for name in whole.texts("sensor")]))
+                filled = {name: cells for name, cells in rows.cells.items() if not rows.is_empty(name)}
+                tables[sensor] = TextTable(path, filled, rows.skipped)
+        return tables
+    for sensor, names in columns.items():
+        own = TextTable(path, {short: table.cells[name] for name, short in names.items()}, table.skipped)
+        read = np.any([own.known(short) for short in own.cells if short != "time"], axis=0)
+        if read.any():
+            tables[sensor] = own.rows(read)
+    return tables
 
 
 def _has_rows(file: Path) -> bool:
@@ -163,14 +211,25 @@ def _samples(table: TextTable, names: tuple[str, ...], repairs: tuple[str, ...])
     return Samples(found.file, found.t_ns, found.values, {**counts, **found.counts})
 
 
-def _add_imu(path: Path, parts: LogParts, samples: Mapping[str, Samples], about: Mapping[str, str]) -> None:
+def _add_imu(
+    path: Path,
+    parts: LogParts,
+    samples: Mapping[str, Samples],
+    about: Mapping[str, str],
+    fixes: LoggedFixes | None,
+) -> None:
     gyro = samples.get("Gyroscope") or samples.get("GyroscopeUncalibrated")
-    accel = _specific_force(path, samples, about)
+    accel, sign_known = _specific_force(samples, about)
+    if accel is not None and not sign_known:
+        sign = 0.0 if gyro is None or fixes is None else sign_by_turn(accel, gyro, fixes)
+        sign = _likely_sign(path, accel, sign)
+        accel = Samples(accel.file, accel.t_ns, accel.values * sign, accel.counts)
     parts.add_inertial(path, gyro, accel, samples, wanted="Accelerometer" in samples)
 
 
-def _specific_force(path: Path, samples: Mapping[str, Samples], about: Mapping[str, str]) -> Samples | None:
-    """Specific force m/s^2: with gravity where the app has it, else the sum, else the uncalibrated one."""
+def _specific_force(samples: Mapping[str, Samples], about: Mapping[str, str]) -> tuple[Samples | None, bool]:
+    """Specific force m/s^2, and whether its sign is known: with gravity where the app has it, else the sum, else the
+    uncalibrated one, whose unit shows the system."""
     ios = about.get("platform", "").lower() in ("ios", "ipados", "iphone")
     standard = about.get("standardisation", about.get("standardization", "")).lower() in ("true", "1", "yes", "on")
     sign, unit = (1.0 if standard or not ios else -1.0), (1.0 if standard or not ios else STANDARD_GRAVITY)
@@ -183,22 +242,24 @@ def _specific_force(path: Path, samples: Mapping[str, Samples], about: Mapping[s
         if not about:  # units of iOS show the system
             unit = STANDARD_GRAVITY if np.median(np.linalg.norm(found.values, axis=1)) < 3.0 else 1.0
             sign = -1.0 if unit != 1.0 else 1.0
-            return Samples(found.file, found.t_ns, found.values * sign * unit, found.counts)
+            return Samples(found.file, found.t_ns, found.values * sign * unit, found.counts), True
         sign *= unit
     else:
-        return None
-    if not about and "TotalAcceleration" not in samples:
-        sign = _likely_sign(path, found)
-    return Samples(found.file, found.t_ns, found.values * sign, found.counts)
+        return None, True
+    known = bool(about) or "TotalAcceleration" in samples
+    return Samples(found.file, found.t_ns, found.values * sign, found.counts), known
 
 
-def _likely_sign(path: Path, force: Samples) -> float:
-    """Sign of iOS or Android where the log does not say which: a phone lies on its back, or its top is up."""
+def _likely_sign(path: Path, force: Samples, by_turn: float) -> float:
+    """Sign of iOS or Android where the log does not say which: by the turns, else a phone lies on its back, or its top
+    is up."""
     middle = np.median(force.values, axis=0)
-    axis = int(np.argmax(np.abs(middle)))
-    sign = -1.0 if middle[axis] < 0 else 1.0
+    sign = by_turn or (-1.0 if middle[int(np.argmax(np.abs(middle)))] < 0 else 1.0)
     system = "iOS (opposite sign)" if sign < 0 else "Android"
-    _log.warning("%s: no Metadata: taken as of %s, by the axis that points up", path, system)
+    how = "turns of the gyroscope and the course of the fixes agree so"
+    if not by_turn:
+        how = "a phone mostly lies on its back or with its top up; else give the Metadata.csv of the app"
+    _log.warning("%s: no Metadata: taken as of %s: %s", path, system, how)
     return sign
 
 

@@ -1,4 +1,6 @@
-"""SensorLog (Bernd Thomas; iOS): CSV, one row of all sensors at a time, with up to three clocks.
+"""SensorLog (Bernd Thomas; iOS): CSV or JSON, one row of all sensors at a time, with up to three clocks.
+
+JSON is a list of rows, one row a line, or one list a column.
 
 Each sensor has its stamp in seconds since the phone was booted, fixes theirs since 1970, and each row the local time
 at which it was logged, often without zone. The zone is that, to a quarter of an hour, which puts the rows just after
@@ -8,6 +10,7 @@ of specific force, or motionUserAcceleration + motionGravity alike; -1 and -9999
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -27,8 +30,8 @@ from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples, clock_offset
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.stamps import has_zone
-from smartnav_graph.readers.text import TextTable, read_text
-from smartnav_graph.readers.text_lines import heading_of
+from smartnav_graph.readers.text import TextTable, read_bytes, read_text
+from smartnav_graph.readers.text_lines import head_of, heading_of
 from smartnav_graph.readers.units import quantity_in
 from smartnav_graph.session.session import Session
 
@@ -39,12 +42,49 @@ _MARKS = {"loggingtime", "locationlatitude", "motionuseraccelerationx", "acceler
 def _matches(source: str) -> bool:
     try:
         path = Path(source)
-        if not path.is_file() or path.suffix.lower() not in (".csv", ".txt", ".tsv"):
+        if not path.is_file() or path.suffix.lower() not in (".csv", ".txt", ".tsv", ".json"):
             return False
-        names = {quantity_in(name) for name in heading_of(path)}
+        head = re.findall(r'"([^"]+)"\s*:', head_of(path)) if path.suffix.lower() == ".json" else heading_of(path)
+        names = {quantity_in(name) for name in head}
         return len(names & _MARKS) >= 2 and names.isdisjoint({"timesincestartinms"})
     except (OSError, ValueError):  # ValueError: a zero byte in the name
         return False
+
+
+def _of_json(path: Path) -> TextTable:
+    """The rows of a JSON file; a cell that a row lacks is empty.
+
+    Raises
+    ------
+    SessionError
+        No JSON, or rows that are no objects.
+    """
+    text = read_bytes(path).decode("utf-8-sig", errors="replace").strip()
+    try:
+        try:
+            found = json.loads(text)
+        except ValueError:
+            found = [json.loads(line.rstrip(",")) for line in text.splitlines() if line.strip(" ,[]")]
+    except (ValueError, RecursionError) as error:
+        raise SessionError(path, f"is no JSON ({error})", "a whole JSON file", "export the recording again") from error
+    if isinstance(found, dict):
+        columns = {name: cells for name, cells in found.items() if isinstance(cells, list)}
+        if len({len(cells) for cells in columns.values()}) != 1:
+            lengths = ", ".join(f"{name} {len(cells)}" for name, cells in columns.items()) or "none"
+            raise SessionError(
+                path, f"has lists of different length ({lengths})"[:300], "one list a column", "export it again"
+            )
+        return TextTable.of(path, {name: [_cell(cell) for cell in cells] for name, cells in columns.items()})
+    if not isinstance(found, list) or not found or not all(isinstance(row, dict) for row in found):
+        raise SessionError(
+            path, "is no list of rows", "[{loggingTime: ..., ...}, ...]", "export it as JSON or CSV again"
+        )
+    names = dict.fromkeys(name for row in found for name in row)
+    return TextTable.of(path, {name: [_cell(row.get(name)) for row in found] for name in names})
+
+
+def _cell(value: object) -> str:
+    return "" if value is None else str(value).strip()
 
 
 def _column(table: TextTable, *starts: str) -> str | None:
@@ -66,7 +106,7 @@ class _Clock:
         self.epoch = "unix"
         if logged is not None:
             self.logged = table.times(logged)
-            if not has_zone(str(table.texts(logged)[0])):
+            if not has_zone(str(table.cells[logged][0].as_py())):
                 self.logged = self.logged - self._zone_ns(self.logged)
         self.offset: int | None = None
 
@@ -110,7 +150,7 @@ def _marked(values: Floats) -> Floats:
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
     path = Path(source)
-    table = read_text(path, whole=True)
+    table = _of_json(path) if path.suffix.lower() == ".json" else read_text(path, whole=True)
     clock, parts = _Clock(table), LogParts()
     channels = channels_of(table)
     force, gyro = _force(channels, clock, repairs), _gyro(channels, clock, repairs)
@@ -124,7 +164,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if channels.has("lat", "lon"):
         _add_fixes(channels, clock, parts)
     device = _column(table, "deviceid")
-    name = str(table.texts(device)[0]) if device is not None else "iPhone"
+    name = str(table.cells[device][0].as_py()) if device is not None else "iPhone"
     name = name if re.search(r"[A-Za-z]{3}", name) else "iPhone"
     return log_session(parts, repairs, name=name, epoch=clock.epoch)
 
@@ -184,7 +224,7 @@ def _add_fixes(channels: Channels, clock: _Clock, parts: LogParts) -> None:
 READER = Reader(
     name="sensorlog",
     summary="SensorLog app (iOS): one row of all sensors",
-    recognised_by="CSV with columns such as loggingTime, accelerometerAccelerationX, motionUserAccelerationX",
+    recognised_by="CSV or JSON with columns such as loggingTime, accelerometerAccelerationX, motionUserAccelerationX",
     matches=_matches,
     read_source=_read,
 )
