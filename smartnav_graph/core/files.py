@@ -7,6 +7,7 @@ import fcntl
 import logging
 import os
 import shutil
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from smartnav_graph.core.errors import SessionError, SmartnavError
 from smartnav_graph.core.interrupts import held
 
 ROW_GROUP = 1 << 20
+LARGEST_TOML = 10_000_000  # bytes
 UNFINISHED = ".writing"  # ending of the temporary folders
 _REPLACED = "replaced"
 _LOG = logging.getLogger(__name__)
@@ -32,10 +34,14 @@ _claimed: dict[Path, int] = {}
 def read_toml(path: Path, fault: type[SmartnavError], what: str) -> dict[str, Any]:
     """The tables of a TOML file; `what` it should be (``a config.toml``) is part of the `fault` raised otherwise."""
     try:
+        if not stat.S_ISREG(path.stat().st_mode) or path.stat().st_size > LARGEST_TOML:
+            raise fault(path, "is no file, or a very large one", f"{what} of at most {LARGEST_TOML} bytes")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise fault(path, f"cannot be read ({error.strerror})", what) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise fault(path, "is nested too deeply", what) from error
+    except ValueError as error:  # no TOML, no UTF-8, a number of thousands of digits
         raise fault(path, f"is no TOML ({error})", what) from error
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cattrs
 import tomli_w
 
-from smartnav_graph.core.errors import ConfigError, SmartnavError
+from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import read_toml
+from smartnav_graph.core.tables import structured
 from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig
 from smartnav_graph.factors import FACTORS
 from smartnav_graph.graph.keyframes import KeyframeConfig
@@ -91,9 +91,6 @@ class Config(FactorConfigs, GeneralConfig):  # type: ignore[misc]
     """All options: the sections of `GeneralConfig`, and one section for each of the factors (`FACTORS`)."""
 
 
-_converter = cattrs.Converter(forbid_extra_keys=True)
-
-
 def from_dict(data: dict[str, Any], where: str | Path = "config.toml") -> Config:
     """Config of a parsed TOML table.
 
@@ -102,22 +99,7 @@ def from_dict(data: dict[str, Any], where: str | Path = "config.toml") -> Config
     ConfigError
         Unknown section or key (named with its path), wrong type or value.
     """
-    try:
-        return _converter.structure(data, Config)
-    except cattrs.BaseValidationError as error:
-        named = _named_cause(error)
-        if named is not None:
-            raise named from error
-        text = "; ".join(cattrs.transform_error(error)).replace("$.", "").replace("@ $", "at the top level")
-        raise ConfigError(where, text, "the sections and keys of the configuration") from error
-
-
-def _named_cause(error: BaseException) -> SmartnavError | None:
-    for inner in getattr(error, "exceptions", ()):
-        found = inner if isinstance(inner, SmartnavError) else _named_cause(inner)
-        if found is not None:
-            return found
-    return None
+    return structured(Config, data, ConfigError, where)
 
 
 def load(path: str | Path) -> Config:

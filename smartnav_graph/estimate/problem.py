@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.tables import check
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.constant_velocity import PREPARE_POSITIONS
@@ -98,7 +100,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     ConfigError
         An option names what is not there.
     """
-    notes = Notes(config, causal)
+    notes = Notes(check(config, ConfigError, "options"), causal)
     positions_only = session.imu is None and bool(session.positions())
     for step in (PREPARE_POSITIONS if positions_only else PREPARE).values():
         session = step(session, notes)

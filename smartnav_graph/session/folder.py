@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import numpy as np
 import tomli_w
 
 from smartnav_graph.core.arrays import Column
-from smartnav_graph.core.errors import CalibrationError, SessionError
-from smartnav_graph.core.files import file_inside, read_table, read_toml, replacing, write_table
+from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.files import file_inside, name_inside, read_table, read_toml, replacing, write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent, watched
+from smartnav_graph.core.tables import structured
 from smartnav_graph.session import repair
 from smartnav_graph.session.calibration.model import calibration_toml, load_calibration
 from smartnav_graph.session.health.units import in_right_units
@@ -103,35 +105,44 @@ def read_header(folder: Path, name: str = "session.toml") -> dict[str, Any]:
     path = folder / name
     if not path.exists():
         raise SessionError(folder, "holds no session.toml", "a session folder", "make one with `smartnav import`")
-    raw = read_toml(path, SessionError, "a session.toml")
-    unknown = sorted(set(raw) - set(HEADER_KEYS))
-    if unknown:
-        raise SessionError(path, f"unknown key {', '.join(unknown)}", f"some of {', '.join(sorted(HEADER_KEYS))}")
-    if raw.get("schema", SCHEMA) != SCHEMA:
-        raise SessionError(path, f"schema = {raw['schema']}", f"{SCHEMA}", "import the log again with this version")
-    gravity = raw.get("gravity_m_s2")
+    header = structured(_Header, read_toml(path, SessionError, "a session.toml"), SessionError, path)
+    if header.schema != SCHEMA:
+        raise SessionError(path, f"schema = {header.schema}", f"{SCHEMA}", "import the log again with this version")
+    gravity, calibration = header.gravity_m_s2, header.calibration
     if gravity is not None and not 9.0 < gravity < 10.5:
         raise SessionError(path, f"gravity_m_s2 = {gravity}", "9.0 to 10.5 m/s^2", "give SI units")
-    try:
-        return {
-            "device": Device(**raw.get("device", {})),
-            "clock_epoch": raw.get("clock", {}).get("epoch", "unknown"),
-            "origin": Origin(**raw["origin"]) if raw.get("origin") else None,
-            "gravity_m_s2": gravity,
-            "sensors": {name: Mount(**_tuples(mount)) for name, mount in raw.get("sensors", {}).items()},
-            "calibration": load_calibration(folder / raw["calibration"]) if "calibration" in raw else None,
-            "repairs": repair.check_names(raw.get("repair", ())),
-        }
-    except TypeError as error:
-        raise SessionError(path, str(error), "the keys of the session format") from error
-    except (SessionError, CalibrationError) as error:
-        raise error.located(path) if isinstance(error, SessionError) else error from error
+    if calibration and not name_inside(calibration):
+        raise SessionError(
+            path, f"calibration = {calibration[:200]!r}", "a file in the session folder", "copy it there"
+        )
+    return {
+        "device": header.device,
+        "clock_epoch": header.clock.epoch,
+        "origin": header.origin,
+        "gravity_m_s2": gravity,
+        "sensors": header.sensors,
+        "calibration": load_calibration(folder / calibration) if calibration else None,
+        "repairs": repair.check_names(header.repair),
+    }
 
 
-def _tuples(value: object) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+@dataclass(frozen=True)
+class _Clock:
+    epoch: str = "unknown"
+
+
+@dataclass(frozen=True)
+class _Header:
+    """session.toml, see `HEADER_KEYS`."""
+
+    schema: int = SCHEMA
+    device: Device = Device()
+    clock: _Clock = _Clock()
+    origin: Origin | None = None
+    gravity_m_s2: float | None = None
+    sensors: Mapping[str, Mount] = field(default_factory=dict)
+    calibration: str = ""
+    repair: tuple[str, ...] = ()
 
 
 def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:

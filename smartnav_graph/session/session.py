@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,6 +25,9 @@ from smartnav_graph.session.streams import Imu, Streams
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
 MOUNTINGS = ("auto", "foot", "body")
+# Mounts: largest lever arm; how far a matrix may be from a rotation; what is no more than rounding.
+FARTHEST_M, ROTATION_ERROR, ROUNDING = 1000.0, 1e-3, 1e-6
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,20 @@ class Mount:
     body_R: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     frame: str = ""
     geoid_m: float = float("nan")
+
+    def __post_init__(self) -> None:
+        R, t = np.array(self.body_R, dtype=np.float64), np.array(self.body_t, dtype=np.float64)
+        if t.shape != (3,) or not (np.abs(t) <= FARTHEST_M).all():
+            expected = f"three numbers of at most {FARTHEST_M:g} m"
+            raise SessionError("session.toml [sensors]", f"body_t = {list(self.body_t)}", expected, "give metres")
+        if R.shape != (3, 3) or not np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_ERROR or np.linalg.det(R) < 0:
+            found, rule = f"body_R = {R.tolist()}", f"the rows of a rotation, to {ROTATION_ERROR:g}"
+            raise SessionError("session.toml [sensors]", found, rule, "give the axes of the sensor in body axes")
+        off = float(np.abs(R @ R.T - np.eye(3)).max())
+        if off > ROUNDING:
+            _LOG.warning("session.toml [sensors]: body_R is a rotation to %.1e only; the nearest rotation is used", off)
+            u, _, vt = np.linalg.svd(R)
+            object.__setattr__(self, "body_R", tuple(tuple(row) for row in (u @ vt).tolist()))
 
     @property
     def above_sea(self) -> bool:

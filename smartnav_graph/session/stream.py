@@ -17,18 +17,28 @@ from smartnav_graph.core.arrays import Column, Floats, Indices, Mask, Table, Tim
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 
+LATEST_NS = 1 << 62
 _DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
 
 
-def quantity(*names: str, optional: bool = False, kind: str = "float", nan: bool | str = False) -> Any:
-    """A field stored as the file columns `names`; `nan` allows unknown values, or names the column that may."""
-    meta = {"columns": names, "kind": kind, "nan": nan}
+# What no reading exceeds, whatever its unit: positions as far as the Moon, forces and rates of a shot.
+LARGEST = 1e9
+
+
+def quantity(
+    *names: str, optional: bool = False, kind: str = "float", nan: bool | str = False, limit: float = LARGEST
+) -> Any:
+    """A field stored as the file columns `names`; `nan` allows unknown values, or names the column that may. No number
+    is larger than `limit`, also in a wrong unit that a repair converts."""
+    meta = {"columns": names, "kind": kind, "nan": nan, "limit": limit}
     return field(metadata=meta) if not optional else field(default=None, metadata=meta)
 
 
-def axes(template: str, names: str = "xyz", *, optional: bool = False, nan: bool = False) -> Any:
+def axes(
+    template: str, names: str = "xyz", *, optional: bool = False, nan: bool = False, limit: float = LARGEST
+) -> Any:
     """A vector stored as one file column per axis: ``{}`` in `template` becomes its name."""
-    return quantity(*(template.format(name) for name in names), optional=optional, nan=nan)
+    return quantity(*(template.format(name) for name in names), optional=optional, nan=nan, limit=limit)
 
 
 def required_columns(spec: Field[object]) -> list[bool]:
@@ -100,10 +110,32 @@ class Stream:
                 found = f"{name} is {array[tuple(where)]} at row {where[0]} ({int(bad.sum())} such values in all)"
                 remedy = "correct the row, or add --repair nan to drop such rows, counted"
                 raise self._error(found, "finite numbers", remedy, int(where[0]))
+            self._check_limit(array, names, spec.metadata["limit"])
         array.flags.writeable = False
         return array
 
+    def _check_limit(self, array: Column, names: tuple[str, ...], limit: float) -> None:
+        beyond = np.argwhere(np.abs(array) > limit)
+        if len(beyond):
+            row, name = int(beyond[0][0]), names[int(beyond[0][1]) if len(names) > 1 else 0]
+            at_s = (int(self.t_ns[row]) - int(self.t_ns[0])) / NS
+            found = (
+                f"{name} is {array[tuple(beyond[0])]:.6g} at row {row}, {at_s:.3f} s ({len(beyond)} such rows in all)"
+            )
+            raise self._error(
+                found, f"-{limit:g} to {limit:g}", "correct the row or the unit, or leave the row out", row
+            )
+
+    def _check_stamps(self) -> None:
+        """Stamps whose differences are numbers of 64 bits."""
+        outside = np.flatnonzero((self.t_ns < -LATEST_NS) | (self.t_ns > LATEST_NS))
+        if len(outside):
+            row = int(outside[0])
+            found = f"t_ns is {self.t_ns[row]} at row {row} ({len(outside)} such rows in all)"
+            raise self._error(found, "nanoseconds of a clock", "check the unit of the stamps", row)
+
     def _check_rows(self) -> None:
+        self._check_stamps()
         present = [name for name in self.ONE_OF if getattr(self, name) is not None]
         if self.ONE_OF and len(present) != 1:
             columns = " or ".join(", ".join(f.metadata["columns"]) for f in self.specs() if f.name in self.ONE_OF)
@@ -170,13 +202,24 @@ class Stream:
             found = [name for name in names if name in table]
             known.update(found)
             if len(found) == len(names):
-                rows: list[Column] = [np.asarray(table[n], dtype=_DTYPES[spec.metadata["kind"]]) for n in names]
+                rows = [cls._typed(n, table[n], spec.metadata["kind"]) for n in names]
                 values[spec.name] = rows[0] if len(names) == 1 else _stacked(rows)
             elif found or spec.default is MISSING:
                 missing = [name for name in names if name not in table]
                 remedy = f"the file has {', '.join(table) or 'no columns'}; rename or add the column"
                 raise cls._error(f"column {', '.join(missing)} is missing", f"columns {', '.join(names)}", remedy)
         return cls(**values, extra={name: np.asarray(table[name]) for name in table if name not in known})
+
+    @classmethod
+    def _typed(cls, name: str, column: Column, kind: str) -> Column:
+        """A column in the type of its kind; a number that is not whole is no whole number."""
+        column = np.asarray(column)
+        if kind == "int" and column.dtype.kind == "f":
+            bad = np.flatnonzero(~(np.abs(column) < 2.0**53) | (column != np.floor(column)))
+            if len(bad):
+                found = f"{name} is {column[bad[0]]!r} at row {bad[0]} ({len(bad)} such rows in all)"
+                raise cls._error(found, "whole numbers with all their digits", "write integers", int(bad[0]))
+        return np.asarray(column, dtype=_DTYPES[kind])
 
 
 def _stacked(columns: list[Column]) -> Column:
@@ -191,6 +234,7 @@ def _stacked(columns: list[Column]) -> Column:
     return rows
 
 
+HIGHEST_M = 1e6  # of a geodetic position
 LLA = ("lat_deg", "lon_deg", "height_m")
 ENU = ("e_m", "n_m", "u_m")
 
@@ -210,6 +254,7 @@ class Located(Stream):
         super()._check_rows()
         if self.lla is None:
             return
+        self._check_limit(self.lla[:, 2], ("height_m",), HIGHEST_M)
         for name, limit, degrees in (("lat_deg", 90.0, self.lla[:, 0]), ("lon_deg", 360.0, self.lla[:, 1])):
             outside = np.flatnonzero(np.abs(degrees) > limit)
             if len(outside):

@@ -10,7 +10,10 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Texts, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import name_inside
+from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.stream import ENU, Label, Located, Positioned, Stream, axes, quantity
+
+LONGEST_GAP_NS = 30 * 86400 * NS  # within one recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +23,17 @@ class Imu(Stream):
     NAME: ClassVar[str] = "imu"
     LABEL: ClassVar[Label] = Label("IMU", colour=(235, 80, 80))
 
-    gyro: Floats = axes("gyro_{}_rad_s")
-    accel: Floats = axes("accel_{}_m_s2")
+    gyro: Floats = axes("gyro_{}_rad_s", limit=1e5)
+    accel: Floats = axes("accel_{}_m_s2", limit=1e6)
+
+    def _check_rows(self) -> None:
+        super()._check_rows()
+        step = np.diff(self.t_ns)
+        if len(step) and int(step.max()) > LONGEST_GAP_NS:
+            row = int(step.argmax()) + 1
+            found = f"t_ns jumps by {step[row - 1] / NS / 86400:.1f} days at row {row}"
+            remedy = "cut the recording there, or correct the stamps or their unit"
+            raise self._error(found, f"gaps of at most {LONGEST_GAP_NS / NS / 86400:g} days", remedy, row)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +43,7 @@ class GnssFix(Positioned):
     NAME: ClassVar[str] = "gnss"
     LABEL: ClassVar[Label] = Label("GNSS", colour=(80, 200, 120))
 
-    velocity: Floats | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True)
+    velocity: Floats | None = quantity("ve_m_s", "vn_m_s", "vu_m_s", optional=True, nan=True, limit=1e5)
     sigma_velocity: Floats | None = quantity("sigma_ve_m_s", "sigma_vn_m_s", "sigma_vu_m_s", optional=True, nan=True)
     fix_type: Times | None = quantity("fix_type", optional=True, kind="int")
 
@@ -119,7 +131,7 @@ class Barometer(Stream):
     LABEL: ClassVar[Label] = Label("Barometer")
     AIDING: ClassVar[bool] = True
 
-    pressure_hpa: Floats = quantity("pressure_hpa")
+    pressure_hpa: Floats = quantity("pressure_hpa", limit=1e7)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +141,7 @@ class Temperature(Stream):
     NAME: ClassVar[str] = "temperature"
     LABEL: ClassVar[Label] = Label("Temperature")
 
-    temperature_c: Floats = quantity("temperature_c")
+    temperature_c: Floats = quantity("temperature_c", limit=1e4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +152,7 @@ class Velocity(Stream):
     LABEL: ClassVar[Label] = Label("Velocity")
     AIDING: ClassVar[bool] = True
 
-    velocity: Floats = axes("v_{}_m_s")
+    velocity: Floats = axes("v_{}_m_s", limit=1e5)
     sigma: Floats | None = axes("sigma_v{}_m_s", optional=True)
 
 
@@ -152,7 +164,7 @@ class WheelSpeed(Stream):
     LABEL: ClassVar[Label] = Label("Wheel speed")
     AIDING: ClassVar[bool] = True
 
-    speed: Floats = quantity("speed_m_s")
+    speed: Floats = quantity("speed_m_s", limit=1e5)
     sigma: Floats | None = quantity("sigma_m_s", optional=True)
 
 

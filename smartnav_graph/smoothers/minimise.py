@@ -32,8 +32,9 @@ class SolveConfig:
     step_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        if not (self.max_iterations > 0 and self.tolerance > 0 and self.step_tolerance > 0):
-            raise ConfigError("config [solver]", "a value <= 0", "> 0")
+        for name in ("max_iterations", "tolerance", "step_tolerance"):
+            if not getattr(self, name) > 0:
+                raise ConfigError("config [solver]", f"{name} = {getattr(self, name)}", "> 0")
 
 
 # Iterations in a row that no longer lower the cost end the search even where a state that nothing holds still moves.

@@ -190,7 +190,7 @@ def strike(folder: Path, name: str, kind: str, rng: random.Random) -> list[str]:
     faults = [] if code in (0, 3, *ALLOWED[kind]) else [f"exit code {code}: {text[-500:]}"]
     if "Traceback" in text:
         faults.append(text[-800:])
-    if seconds > LONGEST_S / 2:
+    if seconds > 0.9 * LONGEST_S:
         faults.append(f"took {seconds:.0f} s")
     there = content(out)
     names = frozenset(file for file, _ in there)

@@ -17,6 +17,7 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
 
+LARGEST_PX = 100_000
 # Numbers of distortion coefficients a model may have.
 MODELS = {"brown": (0, 4, 5, 8), "fisheye": (4,)}
 
@@ -55,11 +56,14 @@ class Camera:
                 f"{len(self.distortion)} distortion coefficients for model {self.model!r}",
                 " or ".join(map(str, MODELS[self.model])),
             )
-        numbers = (*numbers, self.boresight_sigma_deg, self.time_offset_sigma_s)
-        positive = min(self.width, self.height, self.fx, self.fy, self.noise_px) > 0
-        positive &= min(self.readout_s, self.boresight_sigma_deg, self.time_offset_sigma_s) >= 0
-        if not (positive and all(map(math.isfinite, numbers))):
-            raise self._error(f"{self}", "finite numbers; sizes, focal lengths and noise > 0", "give pixels")
+        if not all(map(math.isfinite, numbers)):
+            raise self._error(f"fx, fy, cx, cy, distortion, time_offset_s, readout_s = {numbers}", "finite numbers")
+        for name in ("width", "height", "fx", "fy", "noise_px"):
+            if not 0 < getattr(self, name) <= LARGEST_PX:
+                raise self._error(f"{name} = {getattr(self, name)}", f"0 to {LARGEST_PX} px", "give pixels")
+        for name in ("readout_s", "boresight_sigma_deg", "time_offset_sigma_s"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise self._error(f"{name} = {getattr(self, name)}", "a finite number >= 0")
 
     def _error(self, found: str, expected: str, remedy: str = "see calibration/camera.py") -> CalibrationError:
         return CalibrationError("calibration.toml [cameras]", found, expected, remedy)

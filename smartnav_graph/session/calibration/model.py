@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cattrs
 import numpy as np
 import tomli_w
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import read_toml
+from smartnav_graph.core.tables import structured
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.pieces import Piece
 from smartnav_graph.session.streams import Imu, Temperature
@@ -187,11 +187,15 @@ class MagnetometerNoise:
     soft_iron: tuple[float, ...] = _IDENTITY
 
     def __post_init__(self) -> None:
-        numbers = (*self.hard_iron_ut, *self.soft_iron, self.sigma_ut, self.disturbance_ut, self.disturbance_s)
-        positive = min(self.sigma_ut, self.disturbance_s, self.hard_iron_sigma_ut) > 0 and self.disturbance_ut >= 0
-        if not (all(map(math.isfinite, numbers)) and positive and len(self.soft_iron) == 9):
-            expected = "finite numbers, sigmas > 0, the nine of soft_iron"
-            raise CalibrationError("calibration.toml", f"{self}", expected, "give uT and s")
+        for name in ("sigma_ut", "disturbance_s", "hard_iron_sigma_ut"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise CalibrationError("calibration.toml", f"{name} = {getattr(self, name)}", "> 0", "give uT and s")
+        if not 0 <= self.disturbance_ut < math.inf:
+            raise CalibrationError("calibration.toml", f"disturbance_ut = {self.disturbance_ut}", ">= 0 uT")
+        for name, count in (("hard_iron_ut", 3), ("soft_iron", 9)):
+            numbers = getattr(self, name)
+            if len(numbers) != count or not all(map(math.isfinite, numbers)):
+                raise CalibrationError("calibration.toml", f"{name} = {list(numbers)}", f"{count} finite numbers")
 
 
 # Largest difference of a matrix from the identity; more means other axes or units, not a calibration.
@@ -228,11 +232,13 @@ class ImuErrors:
         by_temperature = (*self.accel_temperature, *self.gyro_temperature)
         numbers = (*self.accel_bias, *self.gyro_bias, *by_temperature, self.temperature_c, *self.temperature_range_c)
         if not all(map(math.isfinite, numbers)):
-            raise CalibrationError("calibration.toml", f"{self}", "finite biases", "give m/s^2 and rad/s")
+            found = f"biases, coefficients or temperatures {list(numbers)}"
+            raise CalibrationError("calibration.toml", found, "finite numbers", "give m/s^2 and rad/s")
         lengths = len(self.accel_temperature), len(self.gyro_temperature)
         if any(length % 3 for length in lengths) or self.temperature_range_c[0] > self.temperature_range_c[1]:
             expected = "as many coefficients for each axis, and a range of temperature from low to high"
-            raise CalibrationError("calibration.toml", f"{self}", expected, "see [imu_errors]")
+            found = f"accel_temperature, gyro_temperature of {lengths} numbers, {self.temperature_range_c} deg C"
+            raise CalibrationError("calibration.toml", found, expected, "see [imu_errors]")
 
     def corrected(self, imu: Imu, temperature: Temperature | None = None) -> Imu:
         """True rate and force, matrix (reading - bias); the same object where there is nothing to do.
@@ -290,24 +296,23 @@ class Calibration:
                     )
 
 
-_converter = cattrs.Converter(forbid_extra_keys=True)
-
-
 def calibration_from_dict(data: dict[str, Any], where: str | Path = "calibration.toml") -> Calibration:
-    """Calibration of a parsed TOML table; missing tables take the class default, unknown keys are refused."""
+    """Calibration of a parsed TOML table; missing tables take the class default, unknown keys are refused.
+
+    Raises
+    ------
+    CalibrationError
+        An unknown key or a value that breaks a rule; it names key, value and rule.
+    """
     filled = dict(data)
     if filled.pop("schema", SCHEMA) not in (1, SCHEMA):
         raise CalibrationError(where, f"schema = {data['schema']}", f"1 or {SCHEMA}", "calibrate with this version")
-    name = filled.get("device_class", "mems")
-    if name not in DEVICE_CLASSES:
+    name, noise = filled.get("device_class", "mems"), filled.get("imu_noise", {})
+    if not isinstance(name, str) or name not in DEVICE_CLASSES:
         raise CalibrationError(where, f"device_class = {name!r}", f"one of {', '.join(DEVICE_CLASSES)}")
-    filled["imu_noise"] = dataclasses.asdict(DEVICE_CLASSES[name]) | dict(filled.get("imu_noise", {}))
-    try:
-        return _converter.structure(filled, Calibration)
-    except CalibrationError as error:
-        raise error.located(where) from error
-    except Exception as error:
-        raise CalibrationError(where, "; ".join(cattrs.transform_error(error)), "known keys with numbers") from error
+    if isinstance(noise, Mapping):
+        filled["imu_noise"] = dataclasses.asdict(DEVICE_CLASSES[name]) | dict(noise)
+    return structured(Calibration, filled, CalibrationError, where)
 
 
 def load_calibration(path: str | Path) -> Calibration:

@@ -32,7 +32,7 @@ class Value:
     """A calibrated number with its standard deviation `sigma` (nan: not known) in `unit`."""
 
     value: float
-    sigma: float
+    sigma: float = field(metadata={"nan": True})
     unit: str
 
     def interval(self, sigmas: float = 1.96) -> tuple[float, float]:
