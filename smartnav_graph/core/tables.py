@@ -6,10 +6,9 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TypeVar, get_args, get_origin, get_type_hints
 
 from smartnav_graph.core.errors import SmartnavError
 
@@ -42,12 +41,11 @@ def structured(kind: type[Kind], table: object, fault: type[SmartnavError], wher
         Of the type `fault`, or of the dataclass' own checks; it names `where`, the key, the value and the rule.
     """
     try:
-        found: Kind = _table(kind, table, "", where)
+        return _table(kind, table, "", where)
     except _BrokenRule as broken:
         raise fault(where, broken.found, broken.rule) from broken
     except RecursionError as error:
         raise fault(where, "is nested too deeply", "tables of keys and values") from error
-    return found
 
 
 def check(value: Kind, fault: type[SmartnavError], where: str | Path) -> Kind:
@@ -55,15 +53,10 @@ def check(value: Kind, fault: type[SmartnavError], where: str | Path) -> Kind:
     return structured(type(value), dataclasses.asdict(value), fault, where)  # type: ignore[call-overload]
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
-def _table(kind: Any, table: object, key: str, where: str | Path) -> Any:
+def _table(kind: type[Kind], table: object, key: str, where: str | Path) -> Kind:
     if not isinstance(table, Mapping):
-        raise _BrokenRule(key, table, f"a table with some of {', '.join(_hints(kind))}")
-    specs = {spec.name: spec for spec in dataclasses.fields(kind) if spec.init}
+        raise _BrokenRule(key, table, f"a table with some of {', '.join(get_type_hints(kind))}")
+    specs = {spec.name: spec for spec in dataclasses.fields(kind)}  # type: ignore[arg-type]
     for name in table:
         if name not in specs:
             close = difflib.get_close_matches(str(name), specs, 1)
@@ -72,7 +65,7 @@ def _table(kind: Any, table: object, key: str, where: str | Path) -> Any:
     for name, spec in specs.items():
         if name not in table and spec.default is spec.default_factory is dataclasses.MISSING:
             raise _BrokenRule(key, table, "a value: it has no default", f"key {_path(key, name)} is missing")
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for name, spec in specs.items():
         if name not in table:
             continue
@@ -80,7 +73,7 @@ def _table(kind: Any, table: object, key: str, where: str | Path) -> Any:
         if isinstance(value, float) and math.isnan(value) and (spec.metadata.get("nan") or default != default):
             values[name] = value
             continue
-        values[name] = _value(_hints(kind)[name], value, _path(key, name), where)
+        values[name] = _value(get_type_hints(kind)[name], value, _path(key, name), where)
         positive = isinstance(default, int | float) and not isinstance(default, bool) and default > 0
         if positive and isinstance(value, int | float) and value < 0:
             raise _BrokenRule(_path(key, name), value, "a number >= 0")
@@ -95,9 +88,9 @@ def _path(key: str, name: str) -> str:
     return f"{key}.{name}" if key else name
 
 
-def _value(kind: Any, value: object, key: str, where: str | Path) -> Any:
+def _value(kind: object, value: object, key: str, where: str | Path) -> object:
     arguments = get_args(kind)
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return _table(kind, value, key, where)
     if isinstance(kind, UnionType) or NoneType in arguments:
         return None if value is None else _value(next(a for a in arguments if a is not NoneType), value, key, where)
@@ -120,10 +113,10 @@ def _value(kind: Any, value: object, key: str, where: str | Path) -> Any:
     largest = LARGEST_NUMBER if kind is float else LARGEST_COUNT
     if not abs(value) <= largest or not math.isfinite(value):
         raise _BrokenRule(key, value, f"a finite number of at most {largest:.0e}")
-    return kind(value)
+    return float(value) if kind is float else value
 
 
-def _list(kinds: tuple[Any, ...], value: object, key: str, where: str | Path) -> tuple[Any, ...]:
+def _list(kinds: tuple[object, ...], value: object, key: str, where: str | Path) -> tuple[object, ...]:
     if not isinstance(value, list | tuple) or len(value) > LONGEST:
         raise _BrokenRule(key, value, "a list")
     if kinds[-1] is Ellipsis:

@@ -69,7 +69,7 @@ def test_cameras_have_their_first_pixel_at_zero(model):
     [
         ("cameras.txt", "1 FOV 100 80 90 50 40 1\n", ("cameras.txt, line 1: camera model FOV", "SIMPLE_PINHOLE")),
         ("cameras.txt", "1 PINHOLE 100 80 90\n", ("line 1: is no camera", "size and parameters of PINHOLE")),
-        ("cameras.txt", "1 PINHOLE 100 80 -9 90 50 40\n", ("line 1", "focal lengths and noise > 0")),
+        ("cameras.txt", "1 PINHOLE 100 80 -9 90 50 40\n", ("line 1", "expected 0 to 100000 px")),
         ("images.txt", "7 1 0 0 0 1 2 x 1 b.jpg\n\n", ("images.txt, line 1: is no image",)),
         ("images.txt", "7 1 0 1 0 1 2 3 1 b.jpg\n\n", ("images.txt, line 1: pose", "a unit quaternion")),
         ("images.txt", "7 1 0 0 0 1 2 3 5 b.jpg\n\n", ("camera 5 is missing in cameras.txt",)),

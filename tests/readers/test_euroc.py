@@ -179,7 +179,7 @@ def test_intrinsics_go_into_the_calibration(asl):
         ("radial-tangential", "spherical", "describes no camera (distortion_model is spherical)"),
         ("458.654, ", "", "describes no camera (not enough values"),
         ("-0.28", "x", "distortion_coefficients is no list of numbers"),
-        ("458.654", "-458.654", "focal lengths and noise > 0"),
+        ("458.654", "-458.654", "expected 0 to 100000 px"),
     ],
 )
 def test_broken_intrinsics_are_reported(asl, old, new, part):

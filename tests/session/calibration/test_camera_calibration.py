@@ -59,7 +59,7 @@ def test_no_points_no_rows():
     [
         ({"model": "pinhole"}, "model = 'pinhole'; expected one of brown, fisheye"),
         ({"distortion": (0.1, 0.2, 0.3)}, "3 distortion coefficients for model 'brown'; expected 0 or 4 or 5 or 8"),
-        ({"fx": 0.0}, "focal lengths and noise > 0"),
+        ({"fx": 0.0}, "expected 0 to 100000 px"),
         ({"cx": float("nan")}, "finite numbers"),
     ],
 )

@@ -78,7 +78,7 @@ def test_text_and_back():
         ({"accel_matrix": (1.0, 0.0, 0.0)}, "accel_matrix = [1.0, 0.0, 0.0]; expected nine numbers within 0.3"),
         ({"gyro_matrix": (0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)}, "of the identity, row by row; turn axes"),
         ({"gyro_matrix": (float("nan"), *GYRO[1:])}, "gyro_matrix = [nan"),
-        ({"gyro_bias": (0.0, float("inf"), 0.0)}, "expected finite biases; give m/s^2 and rad/s"),
+        ({"gyro_bias": (0.0, float("inf"), 0.0)}, "expected finite numbers; give m/s^2 and rad/s"),
     ],
 )
 def test_what_is_no_calibration_is_refused(wrong, part):
