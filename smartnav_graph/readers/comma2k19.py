@@ -76,11 +76,13 @@ def _reference_columns(folder: Path, frame: LocalFrame) -> Table:
 
 def _load(path: Path) -> Floats:
     try:
-        with path.open("rb") as file:
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False), dtype=np.float64)
+        rows = np.lib.format.open_memmap(path, mode="r")  # a header that claims more than the file holds is refused
+        if rows.dtype.kind not in "fiu":
+            raise ValueError(f"it holds {rows.dtype}")
+        return np.array(rows, dtype=np.float64)
     except FileNotFoundError as error:
         raise SessionError(path, "is missing", "a numpy array", "fetch the whole segment") from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
         raise SessionError(path, f"cannot be read ({error})", "a numpy array of numbers") from error
 
 

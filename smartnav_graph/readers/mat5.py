@@ -20,9 +20,12 @@ from smartnav_graph.core.errors import SessionError
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _COMPRESSED, _MATRIX = 15, 14
 _CELL, _STRUCT, _OBJECT, _CHAR, _OPAQUE = 1, 2, 3, 4, 17
-_LONGEST = 1 << 31  # bytes of one variable
+_LONGEST = 1 << 30  # bytes of one variable
 _REFERENCE = 0xDD000000
-_FAULTS = (struct.error, IndexError, ValueError, KeyError, zlib.error, TypeError, RecursionError, OverflowError)
+_FAULTS = (
+    *(struct.error, IndexError, ValueError, KeyError, zlib.error, TypeError, RecursionError, OverflowError),
+    *(MemoryError, AttributeError),
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,11 @@ def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:
         body = data[begin : begin + size]
         at += step
         if kind == _COMPRESSED:
-            yield from _elements(zlib.decompressobj().decompress(body, _LONGEST))
+            unpacker = zlib.decompressobj()
+            inner = unpacker.decompress(body, _LONGEST)
+            if unpacker.unconsumed_tail or not unpacker.eof:
+                raise ValueError(f"a variable is cut, or longer than {_LONGEST} bytes")
+            yield from _elements(inner)
         else:
             yield kind, body
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,15 @@ import numpy as np
 from smartnav_graph.core.arrays import Floats, Table
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.mat5 import variable_names
+
+LARGEST, LONGEST_S = 6 << 30, 120.0  # bytes of memory and seconds that reading a file may take
+# A damaged file can end the interpreter inside SciPy's compiled reader: it is read by another process.
+_LOAD = """
+import pickle, resource, sys
+from scipy.io import loadmat
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+pickle.dump(loadmat(sys.argv[1], appendmat=False), sys.stdout.buffer, protocol=5)
+"""
 
 
 def names_in(path: Path) -> frozenset[str]:
@@ -24,14 +36,20 @@ def read_mat(path: Path) -> Table:
     SessionError
         Missing, unreadable, or no MATLAB file of version 5.
     """
-    from scipy.io import loadmat
-
+    if not path.is_file():
+        raise SessionError(path, "is missing", "a MATLAB file", "fetch the whole data set")
+    command = [sys.executable, "-I", "-c", _LOAD, str(path), str(LARGEST)]
     try:
-        return {name: value for name, value in loadmat(str(path), appendmat=False).items() if not name.startswith("__")}
-    except FileNotFoundError as error:
-        raise SessionError(path, "is missing", "a MATLAB file", "fetch the whole data set") from error
-    except (ValueError, OSError, NotImplementedError, TypeError) as error:
-        raise SessionError(path, f"cannot be read ({error})", "a MATLAB file of version 5") from error
+        done = subprocess.run(command, capture_output=True, timeout=LONGEST_S, check=False)
+        found = done.stderr.decode(errors="replace").strip().rpartition("\n")[2][-300:]
+        table: Table = pickle.loads(done.stdout) if done.returncode == 0 else {}
+    except subprocess.TimeoutExpired:
+        table, found = {}, f"not read after {LONGEST_S:g} s"
+    except (pickle.UnpicklingError, EOFError, MemoryError) as error:
+        table, found = {}, str(error)
+    if not table:
+        raise SessionError(path, f"cannot be read ({found or 'damaged'})", "a MATLAB file of version 5")
+    return {name: value for name, value in table.items() if not name.startswith("__")}
 
 
 def matrix(path: Path, variables: Table, name: str, width: int, rows: int | None = None) -> Floats:

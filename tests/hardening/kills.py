@@ -28,7 +28,7 @@ import pandas as pd
 
 from smartnav_graph.cli import COMMANDS as COMMAND_TABLE
 from smartnav_graph.cli import main
-from smartnav_graph.core.files import replacing
+from smartnav_graph.core.files import UNFINISHED, replacing
 from smartnav_graph.session import folder as sessions
 
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "open", "shutil.rmtree", "shutil.copyfile", "ctypes.dlsym")
@@ -64,8 +64,8 @@ COMMANDS = {
 
 
 def content(path: Path) -> frozenset[tuple[str, str]]:
-    """Names and digests of the files at a path."""
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    """Names and digests of the files at a path, but temporary ones."""
+    files = [path] if path.is_file() else [f for f in path.rglob("*") if f.is_file() and UNFINISHED not in str(f)]
     return frozenset((str(f.relative_to(path)), hashlib.blake2b(f.read_bytes()).hexdigest()) for f in files)
 
 
@@ -213,7 +213,7 @@ def strike(folder: Path, name: str, kind: str, rng: random.Random) -> list[str]:
         for target in [out, *tables]:
             with contextlib.suppress(KeyboardInterrupt), replacing(target):
                 raise KeyboardInterrupt
-        if content(out) != before or [p for p in out.parent.iterdir() if p != out]:
+        if content(out) != before or [p for p in (*out.parent.iterdir(), *out.rglob(f"*{UNFINISHED}")) if p != out]:
             faults.append("the next start does not clear up")
         shutil.rmtree(scratch)
     return [f"{where}: {fault}" for fault in faults]
