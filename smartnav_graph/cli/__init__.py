@@ -27,21 +27,22 @@ if TYPE_CHECKING:
 
 # name -> module, class, one line. Modules are imported when their command is called.
 COMMANDS: dict[str, tuple[str, str, str]] = {
-    "demo": ("demo", "Demo", "process the two recordings of the gtsam package, with report and recording"),
-    "formats": ("sessions", "Formats", "list the formats that can be imported, and how they are recognised"),
+    "demo": ("demo", "Demo", "process the two recordings of the gtsam package, with report"),
+    "formats": ("sessions", "Formats", "list the formats that can be imported"),
     "import": ("sessions", "Import", "import a log of another program into a session folder"),
     "info": ("sessions", "Info", "check a session: streams, rates, data gaps, clock, units"),
     "simulate": ("sessions", "Simulate", "simulate a session with its ground truth"),
     "degrade": ("sessions", "DegradeSession", "add noise and faults to a session"),
     "match": ("match", "Match", "match or track points in the images of a session; compare features"),
     "smooth": ("runs", "Smooth", "compute the trajectory of a session (batch smoothing)"),
-    "replay": ("runs", "Replay", "compute the causal trajectory of a session, one window at a time"),
+    "replay": ("runs", "Replay", "compute the causal trajectory, one window at a time"),
     "evaluate": ("inspection", "Evaluate", "compare a run with a reference trajectory"),
     "intervals": ("intervals", "Intervals", "drift between fixes (simulated outages)"),
-    "calibrate": ("calibrate", "Calibrate", "calibrate sensors, camera, clocks; apply, show or compare a calibration"),
+    "calibrate": ("calibrate", "Calibrate", "calibrate sensors, camera, clocks; show, compare, apply"),
+    "config": ("config", "ConfigCommand", "show the configuration, as the text of a config.toml"),
     "explain": ("inspection", "Explain", "explain which measurements determine the state of a run at one epoch"),
     "compare": ("inspection", "Compare", "compare a run with another run"),
-    "export": ("runs", "Export", "export a run as TUM, KML, GeoJSON, GPX or CSV, or its images with EXIF"),
+    "export": ("runs", "Export", "export a run as TUM, KML, GeoJSON, GPX, CSV, or its images"),
     "view": ("sessions", "View", "show sessions and runs in the Rerun viewer"),
 }
 
@@ -50,7 +51,7 @@ def overview() -> str:
     """The text of ``smartnav --help``."""
     lines = ["usage: smartnav COMMAND ... [--quiet] [--debug]", "", "commands:"]
     lines += [f"  {name:<10}{summary}" for name, (_, _, summary) in COMMANDS.items()]
-    lines += ["", "`smartnav COMMAND --help` shows the options and an example.", "", "Begin with: smartnav demo"]
+    lines += ["", "`smartnav COMMAND --help` shows the options and an example.", "Begin with: smartnav demo"]
     return "\n".join(lines)
 
 
@@ -110,6 +111,7 @@ def _run(name: str, rest: list[str]) -> int:
 
 
 def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
+    from smartnav_graph.cli.help import help_text
     from smartnav_graph.cli.options import parse
     from smartnav_graph.core.files import remove_unfinished, written
 
@@ -117,6 +119,9 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
     with interrupts.raising() as received:
         try:
             kind, name, rest = kind.narrowed(name, rest)
+            if asked := {"-h", "--help", "--help-all"} & set(rest):
+                print(help_text(kind, name, everything="--help-all" in asked))
+                return 0
             command = parse(kind, name, rest)
             logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
             return command.run() or 0

@@ -24,7 +24,7 @@ class Calibrate(Command):
     """Calibrate sensors, camera or clocks from recordings; every value has its sigma, and what the data do not support
     is refused by name.
 
-    Example: smartnav calibrate static six-hours --out calibration.toml --report report.html
+    Example: smartnav calibrate camera pictures --out calibration.toml --report report.html
     """
 
     @classmethod

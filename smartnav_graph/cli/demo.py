@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from smartnav_graph import readers
 from smartnav_graph.cli.options import Command, OutPath
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text, withheld_lines
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.estimate.config import Config, RunConfig
-from smartnav_graph.estimate.run import smooth
-from smartnav_graph.output.run_folder import write_run
-from smartnav_graph.session import folder as session_folder
-from smartnav_graph.session.session import Session
+
+if TYPE_CHECKING:
+    from smartnav_graph.estimate.config import Config
+    from smartnav_graph.session.session import Session
 
 MARK = ".smartnav-demo"
 KEPT = "gnss:every=10"
@@ -32,6 +31,9 @@ class Demo(Command):
     """Folder for everything."""
 
     def run(self) -> None:
+        from smartnav_graph import readers
+        from smartnav_graph.estimate.config import Config, RunConfig
+
         claim(self.out)
         session = write_over(readers.read("gtsam-kitti"), self.out / "kitti")
         print(f"KITTI drive: {len(session.require_imu())} inertial samples")
@@ -47,6 +49,9 @@ class Demo(Command):
         print(f"                  smartnav view {self.out / 'euroc-run'} [--web]")
 
     def _smooth(self, session: Session, config: Config, out: Path, *, brief: bool = False) -> None:
+        from smartnav_graph.estimate.run import smooth
+        from smartnav_graph.output.run_folder import write_run
+
         with progress(self.quiet) as show:
             run = smooth(session, config, progress=show)
             summary = write_run(run, out, force=True, progress=show)
@@ -68,5 +73,7 @@ def claim(out: Path) -> None:
 
 def write_over(session: Session, path: Path) -> Session:
     """Write a session folder, replacing an older one."""
-    session_folder.save(session, path, force=True)
+    from smartnav_graph.session.folder import save
+
+    save(session, path, force=True)
     return session.replace(path=path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -13,9 +13,9 @@ from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import statistics_line
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing
-from smartnav_graph.evaluation import Evaluation, evaluate
-from smartnav_graph.output.run_folder import read_run
-from smartnav_graph.readers.reference import load_reference
+
+if TYPE_CHECKING:
+    from smartnav_graph.evaluation import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +41,10 @@ class Evaluate(Reporting):
     """Added to the time stamps of the reference; auto estimates it."""
 
     def run(self) -> None:
+        from smartnav_graph.evaluation import evaluate
+        from smartnav_graph.output.run_folder import read_run
+        from smartnav_graph.readers.reference import load_reference
+
         offset = _offset(self.time_offset)
         with progress(self.quiet) as show:
             show(f"reading {self.reference}", 0, 0)
@@ -98,6 +102,7 @@ class Explain(Reporting):
 
     def run(self) -> None:
         from smartnav_graph.output.explain import explain
+        from smartnav_graph.output.run_folder import read_run
 
         with progress(self.quiet) as show:
             show(f"reading {self.run_path}", 0, 0)
@@ -124,6 +129,7 @@ class Compare(Reporting):
 
     def run(self) -> None:
         from smartnav_graph.output.run_comparison import compare_runs
+        from smartnav_graph.output.run_folder import read_run
 
         if self.out is not None:
             refuse_existing(self.out, self.force)

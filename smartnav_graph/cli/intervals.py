@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from smartnav_graph import readers
 from smartnav_graph.cli.options import Reporting, SessionCommand, Switch, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import ConfigError, SessionError
-from smartnav_graph.evaluation.intervals import FixesFromReference, Interval, intervals
-from smartnav_graph.readers.reference import load_reference
-from smartnav_graph.session.session import Session
-from smartnav_graph.session.streams import Reference
+
+if TYPE_CHECKING:
+    from smartnav_graph.evaluation.intervals import FixesFromReference, Interval
+    from smartnav_graph.session.session import Session
+    from smartnav_graph.session.streams import Reference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +44,9 @@ class Intervals(SessionCommand, Reporting):
     """Number of noise realisations, seeds 0 to N - 1."""
 
     def run(self) -> None:
+        from smartnav_graph import readers
+        from smartnav_graph.evaluation.intervals import intervals
+
         session = readers.load(self.session, repairs=repairs(self.repair))
         reference = self._reference(session)
         every = numbers("--every", self.every)
@@ -57,6 +60,8 @@ class Intervals(SessionCommand, Reporting):
 
     def _reference(self, session: Session) -> Reference:
         """The reference; that of the session where both are the same log."""
+        from smartnav_graph.readers.reference import load_reference
+
         folder = Path(self.session)
         if self.reference != folder or (folder / "reference.parquet").is_file():
             return load_reference(self.reference)
@@ -67,6 +72,8 @@ class Intervals(SessionCommand, Reporting):
         return session.reference
 
     def _generated(self) -> FixesFromReference:
+        from smartnav_graph.evaluation.intervals import FixesFromReference
+
         if self.seeds < 1:
             raise ConfigError("--seeds", str(self.seeds), ">= 1")
         sigmas = numbers("--fix-sigma", self.fix_sigma)

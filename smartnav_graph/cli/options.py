@@ -8,15 +8,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast
 
 import tyro
 
-from smartnav_graph.estimate import config as config_model
-from smartnav_graph.estimate.config import Config
-from smartnav_graph.output.summary_json import plain
-from smartnav_graph.session import repair as repair_model
+if TYPE_CHECKING:  # what computes is imported when a command runs: its help is there at once
+    from _typeshed import DataclassInstance
 
+    from smartnav_graph.estimate.config import Config
+
+# Fields of the configuration that have an option of their own.
+OWN_OPTIONS = {
+    "run": ("vehicle", "sensors", "withhold", "start_s", "end_s", "initial", "rate"),
+    "vehicle": ("enabled",),
+}
+Made = TypeVar("Made", bound="DataclassInstance")
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 Text = str | None
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SESSION")]
@@ -58,6 +64,8 @@ class Reporting(Command):
 
     def report(self, figures: object, text: str) -> None:
         """Print the figures as JSON, or the text."""
+        from smartnav_graph.output.summary_json import plain
+
         print(dumps(plain(figures), allow_nan=False) if self.json else text)
 
 
@@ -72,31 +80,27 @@ class Writing(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SessionCommand(Command):
-    """A session and the options of the estimation."""
+class Configured(Command):
+    """A command with the options of the configuration."""
 
-    session: SourceName
-    """Session folder, or a log of a known format (see `smartnav formats`)."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """config.toml; the options below override it."""
-    vehicle: Literal["none", "car", "trolley", "foot"] | None = None
-    """What carries the device; by default as in the session."""
-    sensors: Annotated[Text, tyro.conf.arg(metavar="A,B,-C")] = None
-    """Sensors to use, or with a minus to exclude."""
-    withhold: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
-    """Measurements to withhold and to compare with the result: gnss:every=10 uses each tenth fix only,
-    gnss:outage=100-130 withholds 30 s; repeatable."""
-    start: Annotated[float | None, tyro.conf.arg(name="from", metavar="S")] = None
-    """Start time, seconds from the session's start."""
-    end: Annotated[float | None, tyro.conf.arg(name="to", metavar="S")] = None
-    """End time, seconds from the session's start."""
-    initial: Annotated[Text, tyro.conf.arg(metavar="E,N,U,HEADING_DEG[,SIGMA_M,SIGMA_DEG]")] = None
-    """Initial position and heading, instead of the automatic initialisation."""
-    rate: Annotated[Text, tyro.conf.arg(metavar="keyframes|imu|HZ")] = None
-    """Output rate of the trajectory."""
-    repair: Repairs = None
-    """Repairs of faulty rows: nan, order, stamps; units converts readings in another unit."""
-    options: Annotated[tyro.conf.FlagConversionOff[Config], tyro.conf.arg(name="")] = field(default_factory=Config)
+    """config.toml; options override it."""
+    options: object = None
+
+    @classmethod
+    def configuration(cls) -> type:
+        """The configuration, without what has an option of its own."""
+        from smartnav_graph.estimate.config import Config
+
+        sections = []
+        for section in dataclasses.fields(Config):
+            kind = cast("type[DataclassInstance]", section.default_factory)
+            kept = [f for f in dataclasses.fields(kind) if f.name not in OWN_OPTIONS.get(section.name, ())]
+            if section.name in OWN_OPTIONS:
+                rows = [(f.name, f.type, field(default=f.default)) for f in kept]
+                kind = dataclasses.make_dataclass(kind.__name__, rows, frozen=True, namespace={"__doc__": kind.__doc__})
+            sections.append((section.name, kind, field(default_factory=kind)))
+        return dataclasses.make_dataclass("Options", sections, frozen=True)
 
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Self | None:
@@ -106,10 +110,45 @@ class SessionCommand(Command):
             return None
         required = (f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING)
         missing = dict.fromkeys(required, tyro.MISSING)
-        return cls(**missing, options=config_model.load(file))
+        options = cast(type, next(f.default_factory for f in dataclasses.fields(cls) if f.name == "options"))
+        return cls(**missing, options=_like(options(), _loaded(file)))
 
     def resolved(self) -> Config:
-        """The configuration with the options of the command line."""
+        """The configuration: its file, and the options of the command line."""
+        from smartnav_graph.estimate.config import Config
+
+        config: Config = _like(
+            Config() if self.config is None else _loaded(self.config), cast("DataclassInstance", self.options)
+        )
+        return config
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionCommand(Configured):
+    """A session and the options of the estimation."""
+
+    session: SourceName
+    """Session folder, or a log of a known format."""
+    vehicle: Annotated[Literal["none", "car", "trolley", "foot"] | None, tyro.conf.arg(metavar="KIND")] = None
+    """None, car, trolley or foot, if not as in the session."""
+    sensors: Annotated[Text, tyro.conf.arg(metavar="A,-B")] = None
+    """Sensors to use, or with a minus to leave out."""
+    withhold: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="SPEC")] = ()
+    """Leave fixes out and compare: gnss:every=10, gnss:outage=100-130."""
+    start: Annotated[float | None, tyro.conf.arg(name="from", metavar="S")] = None
+    """Start, seconds from the first inertial sample."""
+    end: Annotated[float | None, tyro.conf.arg(name="to", metavar="S")] = None
+    """End, seconds from the first inertial sample."""
+    initial: Annotated[Text, tyro.conf.arg(metavar="E,N,U,H")] = None
+    """First position, m, heading, deg, and maybe sigmas of both."""
+    rate: Annotated[Text, tyro.conf.arg(metavar="HZ")] = None
+    """Rate of the trajectory: keyframes, imu, or Hz."""
+    repair: Repairs = None
+    """Repair faulty rows: nan, order, stamps, units, clock."""
+
+    def resolved(self) -> Config:
+        """The configuration: its file, and the options of the command line."""
+        config = super().resolved()
         asked = given(
             vehicle=self.vehicle,
             sensors=None if self.sensors is None else names(self.sensors),
@@ -119,12 +158,28 @@ class SessionCommand(Command):
             initial=self.initial,
             rate=self.rate,
         )
-        return dataclasses.replace(self.options, run=dataclasses.replace(self.options.run, **asked))
+        return dataclasses.replace(config, run=dataclasses.replace(config.run, **asked))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimating(SessionCommand, Writing):
     """Common options of `smooth` and `replay`."""
+
+
+def _loaded(file: str | Path) -> Config:
+    from smartnav_graph.estimate.config import load
+
+    return load(file)
+
+
+def _like(made: Made, other: DataclassInstance) -> Made:
+    """`made` with the values of `other`, in the sections and fields that both have."""
+    sections = {}
+    for section in dataclasses.fields(made):
+        mine, theirs = getattr(made, section.name), getattr(other, section.name)
+        both = {f.name for f in dataclasses.fields(mine)} & {f.name for f in dataclasses.fields(theirs)}
+        sections[section.name] = dataclasses.replace(mine, **{name: getattr(theirs, name) for name in both})
+    return dataclasses.replace(made, **sections)
 
 
 def given(**options: Any) -> dict[str, Any]:
@@ -139,16 +194,31 @@ def names(text: str | None) -> tuple[str, ...]:
 
 def repairs(text: str | None) -> tuple[str, ...]:
     """The repairs of a comma separated list, checked."""
-    return repair_model.check_names(names(text))
+    from smartnav_graph.session.repair import check_names
+
+    return check_names(names(text))
 
 
 def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
     """The command with its options; raises SystemExit for help (0) and wrong usage (2)."""
     joined = join_values(arguments)
+    kind = _with_configuration(kind)
     default: Any = kind.defaults(joined)
     text = inspect.getdoc(kind)
     found: Command = tyro.cli(kind, prog=f"smartnav {name}", description=text, args=joined, default=default)
     return found
+
+
+def _with_configuration(kind: type[Command]) -> type[Command]:
+    """The class of a command with its configuration as options."""
+    if not issubclass(kind, Configured):
+        return kind
+    options = kind.configuration()
+    annotation = Annotated[tyro.conf.FlagConversionOff[options], tyro.conf.arg(name="")]  # type: ignore[valid-type]
+    row = ("options", annotation, field(default_factory=options))
+    made = dataclasses.make_dataclass(kind.__name__, [row], bases=(kind,), frozen=True, kw_only=True)
+    made.__doc__ = kind.__doc__
+    return made
 
 
 def join_values(arguments: Sequence[str]) -> list[str]:

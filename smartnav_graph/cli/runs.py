@@ -6,24 +6,20 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from smartnav_graph import readers
 from smartnav_graph.cli.options import Estimating, RunPath, Writing, given, repairs
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.core.errors import SessionError, SmartnavError
-from smartnav_graph.estimate.config import Config
-from smartnav_graph.estimate.replay import replay
-from smartnav_graph.estimate.run import Run, smooth
-from smartnav_graph.evaluation import Evaluation, evaluate
-from smartnav_graph.output.export import export, export_pictures
-from smartnav_graph.output.export.smartnav_logger import write_smartnav
-from smartnav_graph.output.run_folder import StoredRun, check_out, read_run, write_run
-from smartnav_graph.output.summary_json import table_of, text_of
-from smartnav_graph.session.calibration import model as calibration_model
+
+if TYPE_CHECKING:
+    from smartnav_graph.estimate.config import Config
+    from smartnav_graph.estimate.run import Run
+    from smartnav_graph.evaluation import Evaluation
+    from smartnav_graph.output.run_folder import StoredRun
 
 # Exit code of a run that is finished and written, and whose measurements exclude each other.
 CONTRADICTORY = 3
@@ -66,6 +62,12 @@ class Replay(Estimating):
 
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> int:
     """Load, estimate, write, print; the exit code."""
+    from smartnav_graph import readers
+    from smartnav_graph.estimate.replay import replay
+    from smartnav_graph.estimate.run import smooth
+    from smartnav_graph.output.run_folder import check_out, write_run
+    from smartnav_graph.output.summary_json import table_of, text_of
+
     check_out(command.out, command.force)
     with progress(command.quiet) as show:
         show(f"reading {command.session}", 0, 0)
@@ -83,6 +85,8 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
 
 def against_own_reference(run: Run) -> Evaluation | None:
     """The comparison with the session's own reference, if it has one."""
+    from smartnav_graph.evaluation import evaluate
+
     if run.session.reference is None:
         return None
     try:
@@ -115,6 +119,11 @@ class Export(Writing):
     """For images: the session, if it was moved."""
 
     def run(self) -> None:
+        from smartnav_graph import readers
+        from smartnav_graph.output.export import export
+        from smartnav_graph.output.export.smartnav_logger import write_smartnav
+        from smartnav_graph.output.run_folder import read_run
+
         if self.format == "smartnav":
             unwritten = write_smartnav(readers.load(self.run_path), self.out, force=self.force)
             left_out = ", ".join(f"{name} {rows}" for name, rows in unwritten.items())
@@ -130,6 +139,11 @@ class Export(Writing):
         print(f"{self.format}: {self.out}")
 
     def _pictures(self, run: StoredRun) -> None:
+        from smartnav_graph import readers
+        from smartnav_graph.output.export import export_pictures
+        from smartnav_graph.output.summary_json import table_of, text_of
+        from smartnav_graph.session.calibration.model import load_calibration
+
         source = self.session or text_of(table_of(run.summary, "session"), "source")
         if not source or not Path(source).exists():
             found = f"was computed from {source}, which does not exist" if source else "does not name its session"
@@ -140,7 +154,7 @@ class Export(Writing):
                 run.named(self.solution),
                 readers.load(source),
                 self.out,
-                calibration=calibration_model.load_calibration(self.run_path / "calibration.toml"),
+                calibration=load_calibration(self.run_path / "calibration.toml"),
                 states=table_of(run.summary, "states"),
                 force=self.force,
                 progress=show,

@@ -14,7 +14,6 @@ from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign
-from smartnav_graph.session import folder as session_folder
 
 HEADER = "session.toml"
 
@@ -68,6 +67,7 @@ class Import(Writing):
     def run(self) -> None:
         from smartnav_graph.readers.columns import parse_columns, save_profile
         from smartnav_graph.readers.join import join
+        from smartnav_graph.session.folder import save
 
         check_session_out(self.out, self.force)
         with progress(self.quiet) as show:
@@ -75,7 +75,7 @@ class Import(Writing):
             columns = None if self.columns is None else parse_columns(self.columns)
             found = join(self.source, self.format, repairs(self.repair), assigned_seconds(self.shift), columns)
             session, ties = found.session, found.ties
-            session_folder.save(session, self.out, force=self.force, progress=show)
+            save(session, self.out, force=self.force, progress=show)
         print("\n".join([session_text(session), *(f"clock: {tie}" for tie in ties)]))
         if self.columns is not None and self.save_columns is not None:
             print(f"columns: {save_profile(self.save_columns, self.columns)}")

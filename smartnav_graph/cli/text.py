@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.text import Text
@@ -17,7 +18,9 @@ from smartnav_graph.output.summary_json import (
     text_of,
     verdict_lines,
 )
-from smartnav_graph.session.session import Session
+
+if TYPE_CHECKING:
+    from smartnav_graph.session.session import Session
 
 STYLES = {
     "contradictory:": "bold red",

@@ -23,7 +23,10 @@ from smartnav_graph.smoothers.minimise import SolveConfig
 
 @dataclass(frozen=True)
 class GapConfig:
-    """What counts as a gap in the inertial data; see `timebase.find_gaps`."""
+    """What counts as a gap in the inertial data; see `timebase.find_gaps`.
+
+    missing_s : shortest time without samples, s; bridged_rows : least samples that lie on a straight line
+    """
 
     missing_s: float = 0.05
     bridged_rows: int = 5
@@ -35,7 +38,7 @@ class RunConfig:
 
     vehicle : none, car, trolley or foot; empty takes the session's own
     sensors : names to use, or names with a leading minus to leave out; empty uses all
-    withhold : specifications of rows withheld and scored; start_s, end_s : stretch, seconds since time zero
+    withhold : specifications of rows withheld and scored; start_s, end_s : from and to, seconds since time zero
     initial : "e,n,u,heading_deg[,sigma_m,sigma_deg]"; rate : ``keyframes`` (and images), ``imu`` or a frequency in Hz
     passes : most solves of a batch run
     """
@@ -113,12 +116,13 @@ def load(path: str | Path) -> Config:
     return from_dict(read_toml(Path(path), ConfigError, "a config.toml"), path)
 
 
-def dumps(config: Config) -> str:
-    """The text of config.toml; options that are not set are left out."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {k: plain(v) for k, v in value.items() if v is not None}
-        return list(value) if isinstance(value, tuple) else value
-
-    return tomli_w.dumps(plain(dataclasses.asdict(config)))
+def dumps(config: Config, *, beside: Config | None = None) -> str:
+    """The text of config.toml; options that are not set are left out, and those equal to the ones of `beside`."""
+    others = {} if beside is None else dataclasses.asdict(beside)
+    tables = {}
+    for section, options in dataclasses.asdict(config).items():
+        known = others.get(section, {})
+        kept = {k: v for k, v in options.items() if v is not None and (k not in known or known[k] != v)}
+        if kept:
+            tables[section] = {k: list(v) if isinstance(v, tuple) else v for k, v in kept.items()}
+    return tomli_w.dumps(tables)

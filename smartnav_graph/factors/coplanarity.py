@@ -48,11 +48,11 @@ LOSS_SCALE = 2.0  # of the Cauchy loss of a match, sigmas
 
 @dataclass(frozen=True)
 class CoplanarityConfig:
-    """enabled; rate_hz : of images of tracks at most; spans : images apart that tracks are paired at; least_parallax :
-    of a pair (median after the rotation is taken out), in sigmas of a match: noise alone makes 1.7;
-    boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's attitude in the body and of its clock as
-    states (zero: known; none given: that of the calibration); row_time : points are taken at the time when the row they
-    lie in was read, where the camera's readout is known."""
+    """enabled : use the matches; rate_hz : of images of tracks at most; spans : images apart that tracks are paired
+    at; least_parallax : of a pair (median after the rotation is taken out), in sigmas of a match: noise alone makes
+    1.7; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's attitude in the body and of its
+    clock as states (zero: known; none given: that of the calibration); row_time : points are taken at the time when
+    the row they lie in was read, where the camera's readout is known."""
 
     enabled: bool = True
     rate_hz: float = 4.0

@@ -47,7 +47,7 @@ SHARE = 0.1  # of the scatter of the force: what does not average out
 @dataclass(frozen=True)
 class GravityConfig:
     """enabled : ``auto`` (on foot, where no position, velocity or rest has come for `ALONE_S`), ``on``, ``off``;
-    stretch_s : over which the force is averaged; speed m/s : of a person, along one horizontal axis."""
+    stretch_s : s, over which the force is averaged; speed : m/s, of a person, along one horizontal axis."""
 
     enabled: str = "auto"
     stretch_s: float = 4.0

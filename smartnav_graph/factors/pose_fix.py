@@ -45,7 +45,8 @@ class PoseFixConfig:
     """loss, gate_probability : as for GNSS fixes; attitude : use the attitudes of rows that have one;
     latency_s : known delay of the stamps, a row stamped t is of t - latency_s and became known at t;
     time_offset_sigma : s, prior of what is left of it, a state (zero: none);
-    lever_arm_sigma : m, mount_sigma_deg : deg, priors of the corrections of a mount that the session does not state."""
+    lever_arm_sigma : m, prior of the lever arm where the session does not state the mount;
+    mount_sigma_deg : deg, prior of its attitude there."""
 
     loss: str = "gate"
     gate_probability: float = 0.999

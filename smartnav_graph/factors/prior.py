@@ -27,7 +27,7 @@ UNKNOWN_PLACE = 1e5  # m
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Sigmas of the first state: angle rad, speed m/s."""
+    """angle_sigma : rad, of the first attitude; speed_sigma : m/s, of the first velocity."""
 
     angle_sigma: float = UNKNOWN_ANGLE
     speed_sigma: float = 100.0

@@ -33,8 +33,8 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """settle_s : stretch after which the latest updates are solved by themselves, so that later windows start from an
-    anchored state; as the gyro bias becomes known it grows to longest_settle_s."""
+    """settle_s : s, after which the latest updates are solved by themselves, so that later windows start from a solved
+    state; longest_settle_s : s, to which it grows as the gyro bias becomes known."""
 
     settle_s: float = 30.0
     longest_settle_s: float = 240.0

@@ -1,6 +1,7 @@
 """The command line, end to end on small simulated sessions: what it writes, says, refuses and returns."""
 
 import csv
+import dataclasses
 import json
 import re
 import shutil
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.cli import COMMANDS, command_class, demo, main, runs
-from smartnav_graph.cli.options import Estimating, join_values, parse
+from smartnav_graph.cli import COMMANDS, command_class, demo, main
+from smartnav_graph.cli.help import described, field_texts
+from smartnav_graph.cli.options import Configured, Estimating, join_values, parse
 from smartnav_graph.estimate import config as config_model
 from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.session.streams import Images
@@ -95,7 +97,7 @@ def test_interrupt_elsewhere_is_130_and_writes_nothing(call, tmp_path, monkeypat
     def interrupted(*_args, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(runs, "smooth", interrupted)
+    monkeypatch.setattr("smartnav_graph.estimate.run.smooth", interrupted)
     code, _, err = call(f"smooth eight --out {tmp_path}/run")
     assert (code, err) == (130, "smartnav: interrupted; nothing was written\n")
     assert list(tmp_path.iterdir()) == []
@@ -383,7 +385,49 @@ def test_every_command_has_help_with_an_example_that_parses(call, name):
     assert (code, err) == (0, "")
     example = re.search(rf"Example: smartnav {name}(.*)", out)
     assert example is not None
-    parse(command_class(name), name, example.group(1).split())  # SystemExit where it is out of date
+    kind, *command = command_class(name).narrowed(name, example.group(1).split())
+    parse(kind, *command)  # SystemExit where it is out of date
+
+
+@pytest.mark.parametrize("command", ["", "smooth", "formats"])
+def test_help_fits_a_screen(call, command):
+    lines = call(f"{command} --help")[1].splitlines()
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if issubclass(command_class(name), Configured)])
+def test_every_option_has_a_sentence_and_is_there_once(call, name):
+    out = call(f"{name} --help-all")[1]
+    options = command_class(name).configuration()
+    for section in dataclasses.fields(options):
+        texts = described(section.default_factory)
+        for field in dataclasses.fields(section.default_factory):
+            assert len(texts[field.name]) > 3, f"{section.name}.{field.name}"
+            assert f"--{section.name}.{field.name}".replace("_", "-") in out
+    assert "--run.vehicle" not in out and "--vehicle.enabled" not in out
+    assert max(len(line) for line in out.splitlines() if not line.startswith("Example")) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_of_a_command_has_a_text(name):
+    kind = command_class(name)
+    texts = field_texts(kind)
+    assert all(texts.get(field.name) for field in dataclasses.fields(kind) if field.name != "options")
+
+
+def test_a_kind_of_calibration_shows_its_own_options(call):
+    out = call("calibrate camera --help")[1]
+    assert "--board VALUE" in out and "Name of the camera" in out
+
+
+def test_config_is_dumped_as_a_file_that_can_be_read(call, tmp_path):
+    code, out, _ = call("config --gnss.loss huber --run.passes 3")
+    assert code == 0 and out == '[run]\npasses = 3\n\n[gnss]\nloss = "huber"\n'
+    file = tmp_path / "config.toml"
+    file.write_text(out)
+    whole = call(f"config --config {file} --dump")[1]
+    file.write_text(whole)
+    assert config_model.load(file) == config_model.from_dict({"run": {"passes": 3}, "gnss": {"loss": "huber"}})
 
 
 def test_overview_and_version(call):

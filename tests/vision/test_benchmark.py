@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
 from smartnav_graph.cli import main
-from smartnav_graph.cli.match import print_scores
+from smartnav_graph.cli.match_tasks import print_scores
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import Reference

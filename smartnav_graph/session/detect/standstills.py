@@ -52,7 +52,8 @@ class StandstillConfig:
     wheels
     detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (as the
     session declares it, else by the data)
-    zupt, zaru : zero velocity, zero angular rate; flat_floor : all stances are on one level, to floor_sigma m
+    zupt : zero velocity; zaru : zero angular rate; flat_floor : all stances are on one level
+    floor_sigma : m, of a stance's level
     """
 
     use_listed: bool = True
