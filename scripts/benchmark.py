@@ -17,6 +17,7 @@ two-view          one pair of 300 matches, 30 % wrong, to kind, pose and covaria
                   OpenCV's findEssentialMat and recoverPose alone
 vision-solve      what image pairs cost a batch run of 20 min (pairs of 50 matches at 1.54 Hz) beyond the same run
                   without images; baseline: scripts/bare_vision_solve.py, CustomFactors in GTSAM's own optimiser
+allan-6h          overlapping Allan deviation of 6 axes, 6 h at 100 Hz; baseline: scripts/bare_allan.py
 recording-37min   run.rrd of the simulated drive of 37 min (222 000 inertial samples), with identity, layout and factor
                   graph; beside it the same with 2000 JPEG pictures; baseline: scripts/bare_recording.py, Rerun's own
                   send_columns of the same arrays
@@ -79,6 +80,11 @@ def bare_two_view() -> Measured:
     return Measured(result.pop("seconds"), None, result)
 
 
+def bare_allan() -> Measured:
+    result = python(str(HERE / "bare_allan.py"))
+    return Measured(result.pop("seconds"), None, result)
+
+
 def bare_recording(session: str, run: str, file: str) -> Measured:
     result = python(str(HERE / "bare_recording.py"), session, run, file)
     return Measured(result.pop("seconds"), None, result)
@@ -101,6 +107,9 @@ def measure(kind: str, path: str) -> None:
         return
     if kind == "two-view":
         measure_two_view()
+        return
+    if kind == "allan":
+        measure_allan()
         return
     if kind.startswith("recording"):
         measure_recording(Path(path), with_pictures=kind.endswith("pictures"))
@@ -165,6 +174,19 @@ def measure_front_end(folder: Path) -> None:
     result = {"pairs_per_s": round(report.pairs / seconds, 1), "cpu_s": round(time.process_time() - cpu, 4)}
     keys = ("pairs", "matches", "ms_picture", "ms_pair")
     print_result(seconds, result | {key: getattr(report, key) for key in keys})
+
+
+def measure_allan() -> None:
+    """The readings of the baseline."""
+    from bare_allan import RATE_HZ, readings
+
+    from smartnav_graph.calibrate.allan import allan_deviation, cluster_sizes
+
+    rows = readings()
+    sizes = cluster_sizes(len(rows))
+    begin = time.process_time()
+    found = allan_deviation(rows, 1 / RATE_HZ, sizes)
+    print_result(time.process_time() - begin, {"cluster_times": len(sizes), "sum": float(found.sum())})
 
 
 def measure_two_view() -> None:
@@ -305,6 +327,8 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
         return lambda: ours("vision", trolley), lambda: bare_vision_solve(trolley), {}
     if name == "two-view":
         return lambda: ours("two-view", "simulated"), bare_two_view, {}
+    if name == "allan-6h":
+        return lambda: ours("allan", "simulated"), bare_allan, {}
     if name == "recording-37min":
         drive = make_session(f"car-{MINUTES}min", folder)
         run, file = make_run(drive, folder), str(folder / "bare.rrd")
@@ -334,7 +358,7 @@ def benchmark(name: str, repeat: int, folder: Path) -> dict[str, Any]:
 
 NAMES = (
     *("batch-37min", "batch-37min-full", "batch-4hz-full", "batch-2h", "replay-fixed-lag"),
-    *("vision-frontend", "two-view", "vision-solve", "recording-37min"),
+    *("vision-frontend", "two-view", "vision-solve", "recording-37min", "allan-6h"),
 )
 
 

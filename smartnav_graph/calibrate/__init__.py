@@ -61,6 +61,30 @@ KINDS: dict[str, CalibrationKind] = {
         "smartnav calibrate camera pictures/ --board chessboard:9x6:0.025 --out calibration.toml --report camera.html",
         paths=True,
     ),
+    "accelerometer": CalibrationKind(
+        "accelerometer",
+        "AccelerometerOptions",
+        "bias, scale and misalignment by rests in several attitudes",
+        "smartnav calibrate accelerometer rests --out calibration.toml",
+    ),
+    "gyro": CalibrationKind(
+        "gyro",
+        "GyroOptions",
+        "scale and misalignment by turns between rests",
+        "smartnav calibrate gyro turns --turn-deg 360 --out calibration.toml",
+    ),
+    "imu": CalibrationKind(
+        "imu",
+        "GyroOptions",
+        "accelerometer and gyro by one recording of rests and turns",
+        "smartnav calibrate imu rests-and-turns --out calibration.toml --report imu.html",
+    ),
+    "static": CalibrationKind(
+        "static",
+        "StaticOptions",
+        "sensors at rest: temperature, drift, noise, Allan deviation",
+        "smartnav calibrate static six-hours --out calibration.toml --report static.html",
+    ),
 }
 
 

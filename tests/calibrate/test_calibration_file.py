@@ -89,7 +89,7 @@ def test_the_report_is_self_contained(tmp_path):
     result = fit([], None)
     write_calibration_report(tmp_path / "r.html", "plain", result.piece("2026-01-01", ["a"]), result.charts)
     text = (tmp_path / "r.html").read_text()
-    assert "http" not in text and "<script" not in text
+    assert "http:" not in text and "https:" not in text and "<script" not in text
     assert 'data-value-name="accel_bias_x" data-value="0.1" data-sigma="0.01"' in text
     assert 'data-value-name="gravity" data-value="9.81">' in text
     assert "gyro_scale: not determined" in text
