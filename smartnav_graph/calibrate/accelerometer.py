@@ -110,7 +110,7 @@ def fit_rests(session: Session, rests: list[RestRows], parameters: int | None = 
     """
     imu, where = session.require_imu(), str(session.path or "session")
     means = np.array([imu.accel[rest.rows].mean(axis=0) for rest in rests]).reshape(-1, 3)
-    apart = attitudes(means)
+    apart = count_attitudes(means)
     if apart <= MODELS[0]:
         found = f"{len(rests)} rests in {apart} attitudes"
         remedy = "hold the device still for two seconds, each axis up and down and at angles between"
@@ -133,7 +133,7 @@ def fit_rests(session: Session, rests: list[RestRows], parameters: int | None = 
     return AccelerometerFit(*fits[best], cross, means)
 
 
-def attitudes(means: Floats) -> int:
+def count_attitudes(means: Floats) -> int:
     """Number of directions among means (m, 3) that are `APART`."""
     kept: list[Floats] = []
     for unit in means / np.linalg.norm(means, axis=1, keepdims=True):

@@ -91,7 +91,7 @@ def _up(force: Floats, accel: AccelerometerFit) -> Floats:
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def integrated(turns: list[Turn], matrix: Floats) -> Floats:
+def attitudes_after(turns: list[Turn], matrix: Floats) -> Floats:
     """Attitude (m, 3, 3) after each turn in axes before it: products of the small rotations, all turns at once."""
     length = max(len(turn.dt) for turn in turns)
     small = np.zeros((len(turns), 1 << (length - 1).bit_length(), 3))
@@ -111,7 +111,7 @@ def _level(up: Floats) -> Floats:
 def misfits(turns: list[Turn], matrix: Floats, known_weight: float) -> Floats:
     """Direction of gravity after each turn by the gyro, across that by the accelerometer (2 m,); then errors of known
     angles, weighted."""
-    attitude = integrated(turns, matrix)
+    attitude = attitudes_after(turns, matrix)
     by_gyro = so3.rotate_back(attitude, np.array([turn.before for turn in turns]))
     after = np.array([turn.after for turn in turns])
     left = np.einsum("nij,nj->ni", _level(after), by_gyro).ravel()
