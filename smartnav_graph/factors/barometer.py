@@ -36,8 +36,8 @@ from smartnav_graph.session.streams import Barometer
 SEA_LEVEL_HPA = 1013.25
 SEA_LEVEL_K, LAPSE_K_M, EXPONENT = 288.15, 0.0065, 5.25588
 HALF_S = 0.5  # samples this long after a keyframe are used: the look-ahead
-# Samples that show their noise: number, and spacing at most, over which a lift changes its speed by 0.1 m/s.
-LEAST_SAMPLES, CLOSE_S = 50, 0.1
+# Means of samples that show their noise: least number, and how much more than that of the class counts.
+LEAST_MEANS, CLEARLY_MORE = 12, 1.5
 UNKNOWN_HEIGHT = 1000.0  # m, of a local frame over the pressure at its start
 
 
@@ -93,7 +93,8 @@ MODEL = AtKeyframe(Height())
 class BarometerBuilder(Builder):
     """Adds the bias of every keyframe, and its height where samples are near.
 
-    t_ns (n,), height (n,) m over nav zero but for the bias, scale m/hPa; bias_sigma m, of the bias at first
+    t_ns (n,), height (n,) m over nav zero but for the bias, scale m/hPa; bias_sigma m, of the bias at first;
+    least_sigma m, of the mean around a keyframe
     """
 
     t_ns: NDArray[np.int64]
@@ -105,6 +106,7 @@ class BarometerBuilder(Builder):
     name: str = "barometer"
     stage: int = 0
     lookahead_s: float = HALF_S
+    least_sigma: float = 0.0
     _start: float = 0.0
     _means: PerWindow[tuple[float, float, float] | None] = field(default_factory=PerWindow)
 
@@ -139,7 +141,7 @@ class BarometerBuilder(Builder):
         if count == 0:
             return None
         later = float((self.t_ns[rows] - window.t1_ns).mean() / NS)
-        sigma = self.scale * self.noise.pressure_sigma / np.sqrt(count)
+        sigma = max(self.scale * self.noise.pressure_sigma / np.sqrt(count), self.least_sigma)
         return float(self.height[rows].mean()), later, float(sigma)
 
 
@@ -158,16 +160,23 @@ def build(context: FactorContext) -> BarometerBuilder | None:
     if options.reference_hpa is not None:
         sigma = options.reference_sigma
     scale, noise = metres_a_hpa(float(stream.pressure_hpa[0])), context.calibration.barometer_noise
-    noise = replace(noise, pressure_sigma=max(noise.pressure_sigma, scatter_hpa(stream)))
-    return BarometerBuilder(stream.t_ns, height, scale, sigma, noise, options.loss)
+    least_sigma = scale * scatter_hpa(stream, noise)
+    return BarometerBuilder(stream.t_ns, height, scale, sigma, noise, options.loss, least_sigma=least_sigma)
 
 
-def scatter_hpa(stream: Barometer) -> float:
-    """White noise (hPa) of samples by the median of their second differences, which have six times its variance; zero
-    where these are too far apart to show it beside a change of height."""
-    if len(stream) < LEAST_SAMPLES or float(np.median(np.diff(stream.t_ns))) > CLOSE_S * NS:
+def scatter_hpa(stream: Barometer, noise: BarometerNoise) -> float:
+    """Standard deviation (hPa) of the means over twice `HALF_S` by the median of their second differences, which have
+    six times their variance: draughts do not average out as white noise does. Zero where that is about what the noise
+    of the samples makes, or where there are too few."""
+    second = np.asarray((stream.t_ns - stream.t_ns[0]) // round(2.0 * HALF_S * NS))
+    first = np.flatnonzero(np.diff(second, prepend=-1))
+    counts = np.diff(np.append(first, len(second)))
+    means = np.add.reduceat(stream.pressure_hpa, first) / counts
+    together = np.diff(second[first], n=2) == 0
+    if together.sum() < LEAST_MEANS:
         return 0.0
-    return float(np.median(np.abs(np.diff(stream.pressure_hpa, n=2))) / (norm.ppf(0.75) * np.sqrt(6.0)))
+    found = float(np.median(np.abs(np.diff(means, n=2)[together])) / (norm.ppf(0.75) * np.sqrt(6.0)))
+    return found if found > CLEARLY_MORE * noise.pressure_sigma / np.sqrt(np.median(counts)) else 0.0
 
 
 def _heights(stream: Barometer, context: FactorContext) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -192,10 +193,21 @@ def test_the_bias_walks_with_the_root_of_the_time():
     assert sigmas == pytest.approx([0.5 * 8.4 * 0.003, 8.4 * 0.003, 2.0 * 8.4 * 0.003])
 
 
-def test_samples_show_their_own_noise_while_a_lift_goes_up_and_a_door_slams():
-    t = np.arange(0.0, 60.0, 0.02)
-    pressure = 1000.0 - 0.12 * 2.0 * t + np.random.default_rng(0).normal(0.0, 0.1, len(t))  # 2 m/s
+def test_means_show_their_own_noise_while_a_lift_goes_up_and_a_door_slams():
+    """Draughts that last for seconds, 0.1 hPa: means over a second vary by nearly as much."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 120.0, 0.02)
+    pressure = 1000.0 - 0.12 * 2.0 * t + rng.normal(0.0, 0.03, len(t))  # 2 m/s
     pressure[1000:1010] += 2.0
-    stream = Barometer(t_ns=ns_from_seconds(t), pressure_hpa=pressure)
-    assert scatter_hpa(stream) == pytest.approx(0.1, rel=0.1)  # hPa
-    assert scatter_hpa(stream.take(slice(None, None, 50))) == 0.0  # too far apart
+    draughts = np.repeat(rng.normal(0.0, 0.1, 120), 50)
+    quiet, shaken = (Barometer(t_ns=ns_from_seconds(t), pressure_hpa=p) for p in (pressure, pressure + draughts))
+    assert scatter_hpa(quiet, BarometerNoise()) == 0.0
+    assert scatter_hpa(shaken, BarometerNoise()) == pytest.approx(0.1, rel=0.25)  # hPa, of 118 means
+    assert scatter_hpa(shaken.take(slice(0, 500)), BarometerNoise()) == 0.0  # ten seconds
+
+
+def test_no_mean_is_better_than_means_are_alike():
+    built = BarometerBuilder(np.zeros(0), np.zeros(0), 8.3, 1.0, BarometerNoise(), "none", least_sigma=0.5)
+    built = replace(built, t_ns=np.arange(0, 100) * NS // 50, height=np.zeros(100))
+    window = SimpleNamespace(t1_ns=NS, length_s=1.0)
+    assert built._around(window)[2] == 0.5  # m
+    assert replace(built, least_sigma=0.0)._around(window)[2] == pytest.approx(8.3 * 0.03 / np.sqrt(50), rel=0.02)

@@ -6,7 +6,7 @@ With whitened residuals r and Jacobian A of all factors at the solution, and the
 
 is what one more iteration of least squares with x as states without priors finds. Tested one by one are the clock
 offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of accelerometer and gyroscope, and
-the focal length of the camera.
+the focal length of the camera; where several sensors measure the position, an offset of each to the others.
 
 Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.4; Rao (1973), Linear statistical inference, 6e.
 """
@@ -48,7 +48,8 @@ PAIRS, FOCAL_STEP = "image_pairs", 1e-4
 class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
     stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale`` and ``gyro
-    scale`` along the body axis `axis`; ``focal length`` (relative)."""
+    scale`` along the body axis `axis`; ``focal length`` (relative); ``offset`` (m) of its positions to the east,
+    north or up."""
 
     sensor: str
     kind: str
@@ -156,6 +157,9 @@ def _of_positions(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tup
             yield SensorError(sensor, "clock jump", t_ns=rows[first][0].name.t_ns), moved[first:]
         for axis in range(3):
             yield SensorError(sensor, "lever arm", "xyz"[axis]), [(part.row, W[:, axis]) for part, W, _ in rows]
+            if len(solved.fixes) > 1:
+                shifted = [(part.row, W @ R[k].T[:, axis]) for part, W, k in rows]
+                yield SensorError(sensor, "offset", ("east", "north", "up")[axis]), shifted
 
 
 def _of_inertial_data(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tuple[SensorError, Derivatives]]:

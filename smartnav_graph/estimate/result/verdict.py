@@ -47,6 +47,8 @@ REJECTED_RUN, REJECTED_S, REJECTED_SHARE, MOST_REJECTED = 4, 3.0, 0.1, 0.3
 CONTRARY_SHARE = 0.1
 # Biases beyond so many sigmas of what was known of them.
 FAR = 4.0
+# Scatter of the samples of an accelerometer over that of its class; of phones in cars and of feet it is 3.
+SCATTERING = 6.0
 # Noise of a constraint of the motion over that of its class.
 WIDE = 6.0
 # Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
@@ -69,6 +71,8 @@ class Limit:
     remedy: str
 
 
+# Clock errors (s) of more than that say that nothing moves; large ones are looked for before the graph is built.
+LINEAR_S = 20.0
 # Receivers are late, antennas lie beside the device, scale factors of phones are wrong, by less.
 _LATER = "the motion fits with stamps {value:+.1f} s later"
 _SCALED = "of {axis} is {percent:+.1f} % too large by the other sensors"
@@ -84,6 +88,9 @@ LIMITS = {
     "lever arm": Limit(1.5, 4.5, "the motion fits a lever arm {value:+.1f} m longer along {axis}", "correct body_t"),
     "accelerometer scale": Limit(
         0.02, 5.0, "accel " + _SCALED, "calibrate the accelerometer, or check its axes and unit"
+    ),
+    "offset": Limit(
+        2.0, 5.0, "positions lie {value:+.1f} m {axis} of the other sensors", "bring all positions to one datum"
     ),
     "focal length": Limit(0.015, 5.0, "the motion fits a focal length {percent:+.1f} % longer", "calibrate the camera"),
     "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
@@ -181,6 +188,10 @@ def _noise(inputs: VerdictInputs) -> Iterator[Reason]:
     for name, found in worse_than_class(imu, pass_state).items() if imu is not None else ():
         text = f"noise of the {name} is found {found:.1f} times that of its class, and its samples do not show it"
         yield Reason(LEVELS[1], "imu", text, "check units, axes and clock, or calibrate the device", found)
+    scatter = 0.0 if imu is None else imu.sampling_scales()["accel"]
+    if scatter > SCATTERING:
+        text = f"samples of the accelerometer scatter {scatter:.1f} times as much as those of its class"
+        yield Reason(LEVELS[1], "imu", text, "mount the device without vibration, or calibrate it", scatter)
 
 
 def _constraints(inputs: VerdictInputs) -> Iterator[Reason]:
@@ -225,7 +236,8 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
         error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
         size = limit.size * (ON_FOOT if error.sensor == "imu" and inputs.on_foot else 1.0)
-        clear = abs(error.value) > max(size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
+        linear = not error.kind.startswith("clock") or abs(error.value) < LINEAR_S
+        clear = linear and abs(error.value) > max(size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
         known = worst.get(error.sensor)
         if clear and (known is None or abs(error.value / error.sigma) > abs(known.value / known.sigma)):
             worst[error.sensor] = error

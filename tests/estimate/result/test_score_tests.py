@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted_faults import focal_length
-from sessions import recorded, shifted, with_gnss, with_imu
+from sessions import on_control, recorded, shifted, with_gnss, with_imu
 
 import smartnav_graph as sn
 from smartnav_graph.estimate.config import Config
@@ -39,7 +39,8 @@ def found(monkeypatch):
         monkeypatch.setattr(summary, "verdict", verdict)
         kept.clear()
         smooth(session, CONFIG)
-        return {(error.kind, error.axis): error for error in kept if error.t_ns is None}
+        errors = (error for error in kept if error.t_ns is None and error.sensor != "control")
+        return {(error.kind, error.axis): error for error in errors}
 
     return of
 
@@ -69,6 +70,15 @@ def test_a_clock_at_another_rate(eight, found):
 def test_a_wrong_lever_arm(eight, found):
     wrong = eight.replace(sensors={"gnss": Mount(body_t=(-1.0, 0.0, 0.0))})
     assert_near(found(wrong)["lever arm", "x"], 1.0)  # m
+
+
+def test_positions_of_another_datum_than_surveyed_points(eight, found):
+    points = on_control(eight, np.arange(5, 115, 10), 0.05, seed=1)
+    assert abs(found(eight.replace(control=points))["offset", "east"].value) < 0.5  # m
+    shifted_fixes = with_gnss(eight, lla=None, enu=eight.nav_position(eight.gnss) + 5.0 * np.eye(3)[0])
+    both = found(shifted_fixes.replace(control=points))
+    assert both["offset", "east"].value == pytest.approx(5.0, abs=0.5)  # m, of the fixes
+    assert abs(both["offset", "north"].value) < 1.0  # points and fixes that exclude each other bend the path
 
 
 def test_a_wrong_gyro_scale(eight, found):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from planted_faults import inertial_noise
 
 import smartnav_graph as sn
 from smartnav_graph.estimate.result import verdict as verdicts
@@ -76,6 +77,11 @@ def test_faults_are_not_good(drive, fault):
     change, level, word = FAULTS[fault]
     found, text = verdict(change(drive))
     assert found != "good" and (level is None or found == level) and word in text, text
+
+
+def test_samples_that_scatter_are_no_good_even_where_that_is_found():
+    level, text = verdict(inertial_noise(10.0)(sn.simulate("figure-eight-60s", 3), np.random.default_rng(0)))
+    assert level != "good" and "times as much as those of its class" in text
 
 
 @pytest.mark.parametrize(("kept", "contrary", "refused", "word"), [(80, 20, "", "20 %"), (0, 9, "why", "none is used")])
