@@ -37,8 +37,8 @@ LEVELS = ("good", "doubtful", "contradictory")
 MISFIT, EXCLUDED = 2.0, 6.0
 # One where residuals are no less than their sigmas.
 NO_LESS = 0.8
-# Sensors under a redescending loss: their tails are expected.
-ROBUST = (*IMAGES, "magnetometer")
+# Sensors under a robust loss: their tails are expected, as those of draughts are.
+ROBUST = (*IMAGES, "magnetometer", "barometer")
 # How rarely a sensor that fits reaches its chi-square.
 RARE = 1e-6
 # Consecutive rejected fixes, seconds of them, and share of all, that speak against the solution rather than the fixes.
