@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from planted_faults import FAULTS, OTHERS, Outcome, Truth, outcome, recording
+from planted_faults import DATASETS, FAULTS, OTHERS, Outcome, Truth, outcome, recording
 
 ALL = {**FAULTS, **OTHERS}
 # One of each detector, and each in a second or so.
@@ -18,6 +18,12 @@ FAST = {
         *("clock +5 s", "clock +3600 s", "accelerometer sign", "gyro in deg/s", "accelerometer in g"),
         *("up axis +x", "multipath of 40 m for 30 s", "scale 5 %", "stale fixes", "filtered fixes", "sigma / 100"),
         *("pressure in Pa", "false standstill", "heights 47 m up"),
+        *(
+            "every second fix 150 m away",
+            "half of the fixes 150 m away",
+            "two receivers 25 m apart",
+            "two height datums",
+        ),
     ),
     "trolley-loop": ("scale 5 %", "lever arm 3 m", "gyro bias 0.2 rad/s"),
 }
@@ -50,6 +56,15 @@ def test_faults_are_not_good(name, fault):
 @pytest.mark.parametrize("fault", ALL)
 def test_every_fault_is_not_good(name, fault):
     assert_right(name, 1, fault)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["trolley-images", "euroc"])
+@pytest.mark.parametrize("fault", [fault for fault in ALL if fault.startswith(("focal", "camera"))])
+def test_camera_faults_are_not_good(name, fault):
+    if name == "euroc" and not (DATASETS / "euroc_v101").exists():
+        pytest.skip("the truth of euroc_v101 is not in SMARTNAV_DATASETS")
+    assert_right(name, 0, fault)
 
 
 @pytest.mark.parametrize("name", FAST)
