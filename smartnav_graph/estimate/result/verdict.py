@@ -53,8 +53,9 @@ SCATTERING = 6.0
 WIDE = 6.0
 # Correlation of neighbouring fix residuals, and the least number of pairs that shows it.
 ALIKE, LEAST_PAIRS = 0.35, 40
-# Fourth moment over the square of the second, and distance (m) of two places that fixes are at in turns.
-TWO_PLACES, LEAST_APART_M = 1.6, 1.0
+# Fourth moment over the square of the second, and distance (m) of two places that fixes are at in turns; of rounded
+# coordinates a device at rest has two in turns, too.
+TWO_PLACES, LEAST_APART_M = 1.6, 5.0
 # RMS at withheld fixes against that of interpolating the kept ones, and the least number of them.
 WORSE_THAN_INTERPOLATION, LEAST_WITHHELD = 1.1, 20
 # Standard deviations by which a mean of squares is clearly larger.
