@@ -12,6 +12,7 @@ from planted_faults import inertial_noise
 import smartnav_graph as sn
 from smartnav_graph.estimate.result import verdict as verdicts
 from smartnav_graph.estimate.result.verdict import interpolated
+from smartnav_graph.estimate.result.score_tests import SensorError
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
 from smartnav_graph.simulation.degrade import Degrade, degrade
@@ -95,6 +96,24 @@ def test_images_that_contradict_the_other_sensors_count(monkeypatch, kept, contr
     assert not list(verdicts._images(inputs))
 
 
+@pytest.mark.parametrize(
+    ("error", "on_foot", "counts"),
+    [
+        (SensorError("gnss", "clock jump", value=3.0, sigma=0.1, t_ns=0), False, True),
+        (SensorError("gnss", "clock jump", value=178.0, sigma=5.0, t_ns=0), False, False),  # nothing moves
+        (SensorError("imu", "gyro scale", "y", value=-0.04, sigma=0.001), False, True),
+        (SensorError("imu", "gyro scale", "y", value=-0.04, sigma=0.001), True, False),  # shocks
+        (SensorError("imu", "gyro scale", "y", value=-0.08, sigma=0.001), True, True),
+    ],
+)
+def test_errors_without_a_state_count_where_they_are_clear_and_what_they_seem(monkeypatch, error, on_foot, counts):
+    monkeypatch.setattr(verdicts, "sensor_errors", lambda _: [error])
+    session = SimpleNamespace(device=SimpleNamespace(forward="+x"), seconds=lambda t_ns: 0.0)
+    solved, fit = SimpleNamespace(problem=SimpleNamespace(session=session)), SimpleNamespace(per_dof=dict)
+    inputs = SimpleNamespace(solved=solved, fit=fit, together=True, on_foot=on_foot)
+    assert bool(list(verdicts._sensor_errors(inputs))) == counts
+
+
 def test_fixes_of_two_places_in_turns_contradict_each_other():
     def reasons(residual: np.ndarray) -> list[str]:
         return [
@@ -108,6 +127,7 @@ def test_fixes_of_two_places_in_turns_contradict_each_other():
     noise, second = rng.normal(0.0, 3.0, (60, 3)), np.arange(60)[:, None] % 2
     assert not reasons(noise) and not reasons(rng.uniform(-3.0, 3.0, (60, 3))) and not reasons(noise[:30])
     assert not reasons(noise + np.where(np.arange(60)[:, None] % 10, 0.0, 40.0))  # outliers
+    assert not reasons(np.round(rng.uniform(0.0, 1.0, (60, 3))))  # m, of a device at rest
     assert "fixes are alternately of two places, 2" in reasons(noise + second * [15.0, 20.0, 0.0])[0]
     assert "heights of the fixes" in reasons(noise + second * [0.0, 0.0, 47.0])[0]
 
