@@ -79,6 +79,12 @@ KINDS: dict[str, CalibrationKind] = {
         "accelerometer and gyro by one recording of rests and turns",
         "smartnav calibrate imu rests-and-turns --out calibration.toml --report imu.html",
     ),
+    "magnetometer": CalibrationKind(
+        "magnetometer",
+        "MagnetometerOptions",
+        "hard and soft iron, strength, turn to the accelerometer",
+        "smartnav calibrate magnetometer turns --out calibration.toml",
+    ),
     "static": CalibrationKind(
         "static",
         "StaticOptions",

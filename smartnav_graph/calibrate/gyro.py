@@ -9,7 +9,7 @@ Materials 7). The bias is the mean rate of the rests before and after.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.calibrate.accelerometer import AccelerometerFit, fit_rests, result_of
-from smartnav_graph.calibrate.least_squares import Adjusted, adjust
+from smartnav_graph.calibrate.least_squares import Adjusted, adjust, derivatives_of
 from smartnav_graph.calibrate.rests import RestRows, check_readings, find_rests
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
 from smartnav_graph.calibrate.static import one_session
@@ -67,6 +67,19 @@ class Turn:
     known: float = 0.0
 
 
+def accelerated_by(session: Session, rests: list[RestRows], accel: AccelerometerFit, options: GyroOptions,
+                   matrix: Floats) -> Callable[[Floats], Floats]:  # fmt: skip
+    """Misfits of the turns as a function of the parameters of the accelerometer."""
+    weight = LEAST_MISFIT / np.radians(options.turn_sigma_deg)
+    axes = _level(np.array([turn.after for turn in turns_between(session, rests, accel, options)]))
+
+    def by(parameters: Floats) -> Floats:
+        other = replace(accel, found=replace(accel.found, parameters=parameters))
+        return misfits(turns_between(session, rests, other, options), matrix, weight, axes)
+
+    return by
+
+
 def turns_between(session: Session, rests: list[RestRows], accel: AccelerometerFit, options: GyroOptions) -> list[Turn]:
     """The turns between neighbouring rests that show anything."""
     imu, found = session.require_imu(), []
@@ -108,13 +121,13 @@ def _level(up: Floats) -> Floats:
     return np.asarray(np.linalg.svd(up[:, None, :])[2][:, 1:])
 
 
-def misfits(turns: list[Turn], matrix: Floats, known_weight: float) -> Floats:
+def misfits(turns: list[Turn], matrix: Floats, known_weight: float, axes: Floats | None = None) -> Floats:
     """Direction of gravity after each turn by the gyro, across that by the accelerometer (2 m,); then errors of known
     angles, weighted."""
     attitude = attitudes_after(turns, matrix)
     by_gyro = so3.rotate_back(attitude, np.array([turn.before for turn in turns]))
     after = np.array([turn.after for turn in turns])
-    left = np.einsum("nij,nj->ni", _level(after), by_gyro).ravel()
+    left = np.einsum("nij,nj->ni", _level(after) if axes is None else axes, by_gyro - after).ravel()
     angles = [
         (np.linalg.norm(turn.dt @ turn.rates @ matrix.T) - turn.known) * known_weight for turn in turns if turn.known
     ]
@@ -161,6 +174,9 @@ def fit_both(session: Session, options: GyroOptions) -> tuple[CalibrationResult,
     accel = fit_rests(session, rests)
     turns = turns_between(session, rests, accel, options)
     found, before = fit_turns(turns, str(session.path or "session"), options)
+    by = accelerated_by(session, rests, accel, options, found.parameters.reshape(3, 3))
+    own = accel.found
+    found = found.with_errors(derivatives_of(by, own.parameters, 0.1 * own.sigmas), own.covariance)
     return result_of(accel, session.gravity, warnings), _gyro_result(found, before, turns, session, rests)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize, stats
@@ -17,6 +17,8 @@ NOISE_PASSES = 6
 class Adjusted:
     """Parameters (p,) with covariance (p, p); residuals (n,), their sigma, and its degrees of freedom.
 
+    gain (p, n) : change of the parameters by that of the residuals
+
     The covariance is widened so that +- 1.96 sigma is the 95 % interval of Student's distribution.
     """
 
@@ -25,6 +27,12 @@ class Adjusted:
     residuals: Floats
     noise: float
     freedom: float
+    gain: Floats
+
+    def with_errors(self, derivatives: Floats, covariance: Floats) -> Adjusted:
+        """The same with the errors of quantities (q,) that the residuals depend on: by their `derivatives` (n, q)."""
+        change = self.gain @ derivatives
+        return replace(self, covariance=self.covariance + change @ covariance @ change.T)
 
     @property
     def sigmas(self) -> Floats:
@@ -41,7 +49,7 @@ def adjust(
     """
     tied = np.isfinite(prior)
     noise, p = max(float(np.std(residuals(nominal))), least_noise), nominal
-    freedom, jacobian, left = 1.0, np.zeros((0, len(p))), np.zeros(0)
+    freedom, jacobian, left, count = 1.0, np.zeros((0, len(p))), np.zeros(0), 0
     for _ in range(NOISE_PASSES):
         scale = noise
 
@@ -57,4 +65,11 @@ def adjust(
         if abs(noise / scale - 1) < 1e-3:
             break
     wider = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
-    return Adjusted(p, np.asarray(np.linalg.inv(jacobian.T @ jacobian) * wider**2), left, noise, freedom)
+    inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+    return Adjusted(p, inverse * wider**2, left, noise, freedom, -inverse @ jacobian[:count].T / noise)
+
+
+def derivatives_of(function: Callable[[Floats], Floats], at: Floats, steps: Floats) -> Floats:
+    """Derivatives (n, q) of a function of (q,) by central differences of `steps` (q,)."""
+    sides = [(function(at + step) - function(at - step)) for step in np.diag(steps)]
+    return np.stack(sides, axis=1) / (2 * steps)
