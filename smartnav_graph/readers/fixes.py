@@ -13,6 +13,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Column, Floats, Mask, Table, Times
 from smartnav_graph.core.frames import Origin
+from smartnav_graph.session.session import Mount
 
 RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))  # of a normal distribution in the plane, in sigmas of an axis
 _MARKS = (-9999.0, -999.0, -1.0)  # of an unknown value, where the value cannot be negative
@@ -27,6 +28,7 @@ class LoggedFixes:
     speed m/s, course deg clockwise from north, with their sigmas
     velocity : (n, 3) m/s east, north, up, where the log has it instead of speed and course; sigma (n,) or (n, 3) m/s
     sigma : (n, 3) m east, north, up, where the log has it instead of accuracies; fix_type : quality of the receiver
+    above_sea : whether heights are above mean sea level, the geoid not being known
     """
 
     t_ns: Times
@@ -43,6 +45,12 @@ class LoggedFixes:
     velocity_sigma: Floats | None = None
     sigma: Floats | None = None
     fix_type: Times | None = None
+    above_sea: bool = False
+
+    @property
+    def mounts(self) -> dict[str, Mount]:
+        """Frame of the stream ``gnss`` as the session has it."""
+        return {"gnss": Mount(frame="msl")} if self.above_sea else {}
 
 
 def unmarked(values: Floats | None, rows: int) -> Floats:

@@ -114,6 +114,7 @@ def _merged(base: Session, other: Session, source: str) -> Session:
     """The streams of both; those of a second receiver become pose fixes."""
     other = _on_one_frame(base, other, source)
     streams: dict[str, Stream] = {}
+    mounts = {**other.sensors, **base.sensors}
     dropped = {**base.dropped, **other.dropped}
     for name, stream in other.streams().items():
         ours = getattr(base, name)
@@ -123,6 +124,8 @@ def _merged(base: Session, other: Session, source: str) -> Session:
             streams[name] = _in_order(ours, stream)
         elif isinstance(stream, GnssFix) and base.pose_fixes is None and not _same_fixes(ours, stream):
             streams["pose_fixes"] = _as_pose_fixes(stream, Path(source).name)
+            if "gnss" not in base.sensors:
+                mounts.pop("gnss", None)
             reasons = {"velocities of a second receiver left out": len(stream)} if stream.velocity is not None else {}
             dropped |= {"pose_fixes": {**reasons, **other.dropped.get("gnss", {})}} if reasons else {}
             dropped["gnss"] = base.dropped.get("gnss", {})
@@ -133,7 +136,7 @@ def _merged(base: Session, other: Session, source: str) -> Session:
         **streams,
         origin=base.origin or other.origin,
         calibration=base.calibration or other.calibration,
-        sensors={**other.sensors, **base.sensors},
+        sensors=mounts,
         pictures=other.pictures if "images" in streams else base.pictures,
         dropped={name: counts for name, counts in dropped.items() if counts},
     )

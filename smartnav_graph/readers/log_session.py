@@ -17,7 +17,7 @@ from smartnav_graph.readers.axes import find_body_axes
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix, fix_table
 from smartnav_graph.readers.samples import Samples, inertial_table, magnetic_table
 from smartnav_graph.readers.source import build_session
-from smartnav_graph.session.session import Device, Session
+from smartnav_graph.session.session import Device, Mount, Session
 
 _log = logging.getLogger(__name__)
 SLOWEST_S = 0.3  # between inertial samples: slower, steps and turns are not seen at all
@@ -31,6 +31,7 @@ class LogParts:
     tables: dict[str, tuple[Path, Table]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     refused: SessionError | None = None
+    mounts: dict[str, Mount] = field(default_factory=dict)
 
     def add(self, stream: str, file: Path, table: Table, counts: Mapping[str, int] | None = None) -> None:
         """One more stream; counts of rows left out, by reason."""
@@ -87,6 +88,7 @@ class LogParts:
         counts |= skipped or {}
         if len(table["t_ns"]):
             self.add("gnss", file, table, counts)
+            self.mounts = fixes.mounts if np.isfinite(table["height_m"]).any() else {}
         else:
             self.count("gnss", counts)
 
@@ -129,7 +131,9 @@ def log_session(
         _log.info("%s: up %s by gravity, forward %s %s", name, up, forward, source)
     origin: Origin | None = first_fix(fixes) if fixes is not None and "lat_deg" in fixes else None
     device = Device(name=name, forward=forward or "+y", up=up or "+z", vehicle=vehicle)
-    session = build_session(parts.tables, repairs, device=device, clock_epoch=epoch, origin=origin)
+    session = build_session(
+        parts.tables, repairs, device=device, clock_epoch=epoch, origin=origin, sensors=parts.mounts
+    )
     names = [*parts.counts, *(stream for stream in session.dropped if stream not in parts.counts)]
     dropped = {stream: {**parts.counts.get(stream, {}), **session.dropped.get(stream, {})} for stream in names}
     return session.replace(dropped={stream: counts for stream, counts in dropped.items() if counts})

@@ -153,8 +153,11 @@ def test_heights_above_the_sea_need_the_geoid_and_are_lifted_by_it(tmp_path):
     session = sn.simulate("figure-eight-60s", 1)
     lla = session.gnss.lla - [0.0, 0.0, 46.5]
     above_sea = session.replace(gnss=replace(session.gnss, lla=lla), sensors={"gnss": Mount(frame="msl")})
-    with pytest.raises(SessionError, match="height of the geoid is not known; give geoid_m"):
-        prepare(above_sea, Config())
+    warning = next(text for text in prepare(above_sea, Config()).warnings if "geoid" in text)
+    assert "so are those of the result; for heights above the ellipsoid give geoid_m" in warning
+    folder.save(above_sea, tmp_path / "t")
+    again = folder.load(tmp_path / "t")
+    assert again.mount("gnss").above_sea and np.isnan(again.mount("gnss").geoid_m)
     folder.save(above_sea.replace(sensors={"gnss": Mount(frame="msl", geoid_m=46.5)}), tmp_path / "s")
     known = folder.load(tmp_path / "s")
     np.testing.assert_allclose(known.nav_position(known.gnss), session.nav_position(session.gnss), atol=1e-6)  # m

@@ -199,6 +199,7 @@ def _fixes(table: TextTable, t_ns: Times) -> LoggedFixes:
         vertical=columns.get("vAcc"),
         velocity=velocity,
         velocity_sigma=columns.get("sAcc"),
+        above_sea=True,
     )
 
 

@@ -12,6 +12,7 @@ import csv
 import json
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         table = tables["Barometer"]
         parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
     location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
-    fixes = None if location is None else _fixes(location)
+    fixes = None if location is None else replace(_fixes(location), above_sea=_is_ios(about))
     if location is not None and fixes is not None:
         parts.add_fixes(location.path, fixes, location.skipped)
     _add_imu(path, parts, samples, about, fixes)
@@ -227,10 +228,15 @@ def _add_imu(
     parts.add_inertial(path, gyro, accel, samples, wanted="Accelerometer" in samples)
 
 
+def _is_ios(about: Mapping[str, str]) -> bool:
+    """Whether a phone of Apple wrote it: its heights are above mean sea level, those of Android ellipsoidal."""
+    return about.get("platform", "").lower() in ("ios", "ipados", "iphone")
+
+
 def _specific_force(samples: Mapping[str, Samples], about: Mapping[str, str]) -> tuple[Samples | None, bool]:
     """Specific force m/s^2, and whether its sign is known: with gravity where the app has it, else the sum, else the
     uncalibrated one, whose unit shows the system."""
-    ios = about.get("platform", "").lower() in ("ios", "ipados", "iphone")
+    ios = _is_ios(about)
     standard = about.get("standardisation", about.get("standardization", "")).lower() in ("true", "1", "yes", "on")
     sign, unit = (1.0 if standard or not ios else -1.0), (1.0 if standard or not ios else STANDARD_GRAVITY)
     if "TotalAcceleration" in samples:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -218,7 +219,8 @@ def _add_fixes(channels: Channels, clock: _Clock, parts: LogParts) -> None:
     else:
         raise SessionError(table.path, "has fixes on another clock than the sensors", "loggingTime", "log it too")
     if known.any():
-        parts.add_fixes(table.path, fixes_of(channels_of(table.rows(known)), t_ns), table.skipped)
+        fixes = replace(fixes_of(channels_of(table.rows(known)), t_ns), above_sea=True)  # CLLocation.altitude
+        parts.add_fixes(table.path, fixes, table.skipped)
 
 
 READER = Reader(

@@ -17,7 +17,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import RADIUS_68, LoggedFixes, unmarked
-from smartnav_graph.readers.positions.track import RANGE_ERROR_M, session_of_fixes, taken_as_ellipsoidal
+from smartnav_graph.readers.positions.track import RANGE_ERROR_M, session_of_fixes
 from smartnav_graph.readers.source import Reader, first_bytes
 from smartnav_graph.readers.text import read_bytes
 from smartnav_graph.session.session import Session
@@ -48,14 +48,13 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     geoid = lla[:, 3]
     if np.isfinite(geoid).any():
         lla[:, 2] += geoid
-    elif np.isfinite(lla[:, 2]).any():
-        taken_as_ellipsoidal(path)
     extra = {name: np.array([_extension(point, names) for point in points]) for name, names in _EXTENSIONS.items()}
     horizontal, vertical = _accuracies(points, extra["accuracy"], extra["vertical"])
     fixes = LoggedFixes(
         *(t_ns, lla[:, 0], lla[:, 1], lla[:, 2], horizontal, vertical),
         speed=_or(points, "speed", extra["speed"]),
         course=_or(points, "course", extra["course"]),
+        above_sea=not np.isfinite(geoid).any(),
     )
     unused = {"points without a time": len(every) - len(points)}
     return session_of_fixes(path, fixes, "unix", repairs, unused)

@@ -19,7 +19,7 @@ from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import LoggedFixes
-from smartnav_graph.readers.positions.track import RANGE_ERROR_M, session_of_fixes, taken_as_ellipsoidal
+from smartnav_graph.readers.positions.track import RANGE_ERROR_M, session_of_fixes
 from smartnav_graph.readers.source import Reader, first_bytes
 from smartnav_graph.readers.text import read_bytes
 from smartnav_graph.session.session import Session
@@ -60,14 +60,13 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         raise SessionError(path, found, "NMEA sentences with positions", "record again with a view of the sky")
     t_ns, epoch = _stamps(used)
     lat, lon, alt, sep = (_column(used, name) for name in ("lat", "lon", "alt", "sep"))
-    if np.isfinite(alt).any() and not np.isfinite(sep).any():
-        taken_as_ellipsoidal(path)
     height = np.where(np.isfinite(sep), alt + sep, np.nan if np.isfinite(sep).any() else alt)
     fixes = LoggedFixes(
         *(t_ns, lat, lon, height),
         speed=_column(used, "spd"),
         course=_column(used, "cog"),
         sigma=_sigma(used),
+        above_sea=not np.isfinite(sep).any(),
         fix_type=np.nan_to_num(_column(used, "quality"), nan=1.0).astype(np.int64),
     )
     return session_of_fixes(path, fixes, epoch, repairs, counts)

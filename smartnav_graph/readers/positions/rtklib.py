@@ -16,7 +16,7 @@ from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.timebase import NS, ns_from_texts
 from smartnav_graph.readers.fixes import LoggedFixes
-from smartnav_graph.readers.positions.track import session_of_fixes, taken_as_ellipsoidal
+from smartnav_graph.readers.positions.track import session_of_fixes
 from smartnav_graph.readers.source import Reader, first_bytes
 from smartnav_graph.readers.text import read_bytes
 from smartnav_graph.session.session import Session
@@ -48,13 +48,14 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
             raise SessionError(path, found, f"{width} as the heading names", "delete it", row=i)
     cells = {name: _numbers(path, name, [row[i + 2] for row in rows]) for i, name in enumerate(names)}
     t_ns = _times(path, [(row[0], row[1]) for row in rows], system)
-    lat, lon, height = _places(path, cells, data).T
+    lat, lon, height = _places(path, cells).T
     fixes = LoggedFixes(
         *(t_ns, lat, lon, height),
         velocity=_group(cells, _VELOCITIES),
         velocity_sigma=_group(cells, _VELOCITY_SIGMAS),
         sigma=_group(cells, _SIGMAS),
         fix_type=cells["Q"].astype(np.int64) if "Q" in cells else None,
+        above_sea=b"WGS84/geodetic" in data,
     )
     return session_of_fixes(path, fixes, "gps" if system == "GPST" else "unix", repairs)
 
@@ -76,15 +77,13 @@ def _group(cells: dict[str, Floats], names: tuple[str, ...]) -> Floats | None:
     return np.stack([cells[name] for name in names], axis=1) if all(name in cells for name in names) else None
 
 
-def _places(path: Path, cells: dict[str, Floats], data: bytes) -> Floats:
+def _places(path: Path, cells: dict[str, Floats]) -> Floats:
     kind = next((kind for kind, names in _PLACES.items() if all(name in cells for name in names)), None)
     if kind is None:
         remedy = "write it again with solution format Lat/Lon/Height, in degrees"
         raise SessionError(path, "holds a baseline or degrees with minutes", "latitude, longitude, height", remedy)
     rows = np.stack([cells[name] for name in _PLACES[kind]], axis=1)
     if kind == "lla":
-        if b"WGS84/geodetic" in data:
-            taken_as_ellipsoidal(path)
         return rows
     import pyproj
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
+
+import numpy as np
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix, fix_table
 from smartnav_graph.readers.source import build_session
 from smartnav_graph.session.session import Session
-
-_log = logging.getLogger(__name__)
 
 # Range error (m, 1 sigma) that turns a dilution of precision into the sigma of a position, by the quality of an NMEA
 # fix: 1 code, 2 differential, 3 encrypted code, 4 carrier phase with fixed and 5 with float ambiguities, 6 dead
@@ -27,15 +26,9 @@ def session_of_fixes(
     if not len(table["t_ns"]):
         found = f"holds no position in {len(fixes.t_ns)} rows"
         raise SessionError(path, found, "at least one fix", "record again with a view of the sky", stream="gnss")
-    session = build_session({"gnss": (path, table)}, repairs, clock_epoch=epoch, origin=first_fix(table))
+    mounts = fixes.mounts if np.isfinite(table["height_m"]).any() else {}
+    session = build_session(
+        {"gnss": (path, table)}, repairs, clock_epoch=epoch, origin=first_fix(table), sensors=mounts
+    )
     counts = {**{reason: count for reason, count in (unused or {}).items() if count}, **counts}
     return session.replace(dropped={**session.dropped, "gnss": counts} if counts else session.dropped)
-
-
-def taken_as_ellipsoidal(path: Path) -> None:
-    """Report heights above mean sea level that are used unchanged."""
-    _log.warning(
-        "%s: heights are above mean sea level, and the height of the geoid is not known; used as they are; for heights "
-        'above the ellipsoid give frame = "msl" and geoid_m in [sensors] of session.toml',
-        path,
-    )

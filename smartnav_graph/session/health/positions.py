@@ -85,10 +85,13 @@ def _sigmas_and_heights(facts: Facts) -> Iterator[Finding]:
             yield Finding(name, text, "used as horizontal fixes", "info" if flat < len(stream) else "warning")
         mount = facts.session.mount(name)
         if mount.above_sea and stream.lla is not None and not np.isfinite(mount.geoid_m):
-            remedy = (
-                f'give geoid_m in [sensors.{name}], the height of the geoid above the ellipsoid there, or frame = ""'
-            )
-            yield Finding(name, 'frame = "msl", but the height of the geoid is not known', remedy, "error")
+            text = "heights are above mean sea level, the height of the geoid is not known: so are those of the result"
+            remedy = f"for heights above the ellipsoid give geoid_m in [sensors.{name}]"
+            located = [other for other, rows in facts.session.positions().items() if rows.lla is not None]
+            others = [other for other in located if not facts.session.mount(other).above_sea]
+            if others:
+                text += f", but those of {', '.join(others)} are not"
+            yield Finding(name, text, remedy, verdict="doubtful" if others else "good")
         elif mount.above_sea:
             yield Finding(name, "heights are above mean sea level, not above the ellipsoid", level="info")
 

@@ -75,9 +75,10 @@ def test_course_does_not_matter_at_rest(tmp_path):
     assert velocity[0, :2].tolist() == [0.0, 0.0]
 
 
-def test_heights_above_the_sea_are_reported(tmp_path, caplog):
-    gnss = read(tmp_path, gga("235958.00", sep="")).gnss
-    assert gnss.lla[0, 2] == 60.0 and "above mean sea level" in caplog.text
+def test_heights_above_the_sea_are_marked(tmp_path):
+    session = read(tmp_path, gga("235958.00", sep=""))
+    assert session.gnss.lla[0, 2] == 60.0 and session.mount("gnss").above_sea
+    assert not read(tmp_path, gga("235958.00")).mount("gnss").above_sea
 
 
 def test_real_logs(dataset):
