@@ -7,16 +7,43 @@ A mutant that is read holds the readings of the export, or says in `dropped` wha
 import random
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "apps"))
-from exports import ACCEL, EXPORTS, GYRO
+from exports import ACCEL, GYRO, UNIX, lat, lines, times
+from exports import EXPORTS as APPS
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
+
+
+def wide(path):
+    """A row of all sensors of an app that is not known."""
+    heading = "timestamp (ms),acc_x (m/s^2),acc_y (m/s^2),acc_z (m/s^2),gyro_x (rad/s),gyro_y (rad/s),gyro_z (rad/s)"
+    rows = [
+        ",".join(map(str, [round((UNIX + t) * 1000), *ACCEL, *GYRO, lat(i // 50), 11.0, 500.0, 3.0]))
+        for i, t in enumerate(times())
+    ]
+    return lines(path, [f"{heading},latitude,longitude,altitude,accuracy", *rows])
+
+
+def euroc(folder):
+    heading = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]"
+    heading += ",a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+    rows = [",".join(map(str, [round((UNIX + t) * 1000) * 10**6, *GYRO, *ACCEL])) for t in times()]
+    lines(folder / "mav0" / "imu0" / "data.csv", [heading, *rows])
+    return folder
+
+
+EXPORTS = {
+    **APPS,
+    "wide-csv": ("log.csv", wide),
+    "euroc": ("V1_01", euroc),
+}
 
 
 def files_of(source):
@@ -128,6 +155,8 @@ def run(name, mutation, seed, tmp_path):
     return source, original, mutated
 
 
+SAME_NS = 5_000_000  # clocks are tied by medians, which a row less moves by less than the step of the rows
+
 # A byte among the numbers of a binary file may be any: nothing shows that it is another.
 BINARY = dict.fromkeys(("gopro", "matlab-mobile"), ("cut", "zeros", "empty", "noise", "mark"))
 # Names and readings of these have other places in their lines: an exchange would give readings other names.
@@ -149,6 +178,27 @@ def test_two_hundred_faulty_exports(tmp_path, name):
             check_mutant(name, mutation, seed, tmp_path / f"{seed} {mutation}")
 
 
+def clock_shift(session, original):
+    """Zero; where the file that ties the clock to Unix time is spoilt, and the epoch unknown, that of the first row."""
+    if session.clock_epoch == original.clock_epoch or session.imu is None:
+        return 0
+    assert session.clock_epoch == "unknown"
+    return int(original.imu.t_ns[0] - session.imu.t_ns[0])
+
+
+def check_fixes(session, whole, where):
+    """Every fix is one of the original: its place, its stamp and its sigma."""
+    original, found = whole.gnss, session.gnss
+    found = replace(found, t_ns=found.t_ns + clock_shift(session, whole))
+    for row in range(len(found)):
+        same = np.abs(found.t_ns[row] - original.t_ns) < SAME_NS
+        same &= np.isclose(found.lla[row, :2], original.lla[:, :2], rtol=0.0, atol=1e-9).all(axis=1)
+        assert same.any(), f"{where}: {found.t_ns[row]} {found.lla[row]}"
+        if found.sigma is not None and original.sigma is not None:
+            known = found.sigma[row, :2]
+            assert np.isnan(known).all() or np.allclose(known, original.sigma[same][0, :2]), f"{where}: {known}"
+
+
 def check_mutant(name, mutation, seed, folder):
     folder.mkdir(parents=True, exist_ok=True)
     source, original, mutated = run(name, mutation, seed, folder)
@@ -156,9 +206,14 @@ def check_mutant(name, mutation, seed, folder):
     if session is None:
         assert source.name in error or mutated.name in error, f"{mutation}: names no file: {error}"
         return
+    if session.gnss is not None and original.gnss is not None:
+        check_fixes(session, original, f"{name}, {mutation} {seed} of {mutated.name}")
     if session.imu is None:
         return
     assert len(session.imu) <= len(original.imu), mutation
+    t_ns = session.imu.t_ns + clock_shift(session, original)
+    nearest = original.imu.t_ns[np.argmin(np.abs(t_ns[:, None] - original.imu.t_ns), axis=1)]
+    assert np.abs(t_ns - nearest).max() < SAME_NS, f"{name}, {mutation} {seed} of {mutated.name}: stamps"
     gyro, accel = session.imu.gyro, session.imu.accel
     right = np.isclose(gyro, GYRO, atol=3e-4).all(axis=1) & np.isclose(accel, ACCEL, atol=2e-3).all(axis=1)
     assert right.all(), f"{name}, {mutation} {seed} of {mutated.name}: {gyro[~right][0]}, {accel[~right][0]}"
@@ -173,5 +228,8 @@ def test_one_sensor_missing(tmp_path, name):
         session, error = attempt(source)
         if session is None:
             assert str(source) in error
+            continue
+        if session.imu is None:
+            assert "there is no" in str(session.dropped["imu"]) and len(session.gnss)
             continue
         assert np.allclose(session.imu.accel, ACCEL, atol=1e-6) and np.allclose(session.imu.gyro, GYRO, atol=1e-9)
