@@ -26,7 +26,7 @@ from smartnav_graph.readers import (
 )
 from smartnav_graph.readers.apps import APP_READERS
 from smartnav_graph.readers.archive import is_archive, unpacked
-from smartnav_graph.readers.positions import gpx, listed, nmea, rtklib
+from smartnav_graph.readers.positions import gpx, gsdc, listed, nmea, rtklib
 from smartnav_graph.readers.robotics import kf_gins, kitti_raw, ros, ulog, vectornav
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.unknown import describe_unknown
@@ -52,6 +52,7 @@ READERS: dict[str, Reader] = {
         nmea.READER,
         gpx.READER,
         rtklib.READER,
+        gsdc.READER,
         listed.FIXES,
         listed.CONTROL,
         ros.READER,

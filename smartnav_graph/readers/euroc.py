@@ -21,6 +21,7 @@ from smartnav_graph.readers.kalibr import kalibr_cameras
 from smartnav_graph.readers.reference import euroc_columns
 from smartnav_graph.readers.source import Reader, build_session, inertial_columns, mount
 from smartnav_graph.readers.text import read_bytes, read_text
+from smartnav_graph.readers.text_lines import heading_of
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Device, Mount, Session
@@ -36,6 +37,8 @@ DEVICE = "EuRoC VI-Sensor ADIS16448"
 
 # Names of distortion in sensor.yaml -> those of `calibration.camera`.
 _MODELS = {"radial-tangential": "brown", "radtan": "brown", "equidistant": "fisheye"}
+_COLUMNS = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+_HEADING = re.compile(r"\s*(?:(timestamp)|([wa])_RS_S_([xyz]))\b")
 _T_BS = re.compile(r"^T_BS:.*?data:\s*\[([^\]]*)\]", re.DOTALL | re.MULTILINE)
 
 
@@ -46,12 +49,19 @@ def _root(source: str) -> Path | None:
     return None
 
 
+def _order(path: Path) -> tuple[str, ...]:
+    """The columns of imu0/data.csv as its heading has them, such as ``w_RS_S_x [rad s^-1]``; those of EuRoC else."""
+    found = [_HEADING.match(name) for name in heading_of(path)]
+    names = ["t" if m[1] else {"w": "g", "a": "a"}[m[2]] + m[3] for m in found if m]
+    return tuple(names) if sorted(names) == sorted(_COLUMNS) and len(names) == len(found) else _COLUMNS
+
+
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
     root = _root(source)
     if root is None:
         raise SessionError(source, "holds no imu0/data.csv", "an ASL folder (mav0)", "give the folder that holds imu0")
     imu = root / "imu0" / "data.csv"
-    rows = read_text(imu, names=("t", "gx", "gy", "gz", "ax", "ay", "az"))
+    rows = read_text(imu, names=_order(imu))
     samples = inertial_columns(rows.ints("t"), rows.floats("gx", "gy", "gz"), rows.floats("ax", "ay", "az"))
     tables: dict[str, tuple[Path, Table]] = {"imu": (imu, samples)}
     cameras = sorted(file.parent.name for file in root.glob("cam*/data.csv"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,10 +120,28 @@ def _table(path: Path, text: str, likely: tuple[str, ...]) -> UnknownFile:
     what = f"{marks.get(separator, separator)} separated text with {len(names)} columns"
     kept = [row for row in cells if len(row) >= len(names)]
     if len(names) < 2 or len(kept) < 3:
-        return UnknownFile(path, (*likely, f"text without a table of at least three rows ({what})"))
+        return _rows_amid_text(path, text, likely) or UnknownFile(
+            path, (*likely, f"text without a table of at least three rows ({what})")
+        )
     columns = {name: [row[i] for row in kept] for i, name in enumerate(names)}
     shown = f"{what}: {', '.join(names[:12])}" + (f" and {len(names) - 12} more" if len(names) > 12 else "")
     return _fitting(path, (*likely, shown), columns)
+
+
+def _rows_amid_text(path: Path, text: str, likely: tuple[str, ...]) -> UnknownFile | None:
+    """Of a file whose rows come after lines of other text: the most frequent kind of row; None where there is none."""
+    lines = [line.strip() for line in text.splitlines()]
+    kinds = Counter((mark, line.count(mark)) for line in lines for mark in ",;\t" if line.count(mark) > 1)
+    if not kinds:
+        return None
+    (mark, count), rows = kinds.most_common(1)[0]
+    if rows < 3:
+        return None
+    table = [line.split(mark) for line in lines if line.count(mark) == count]
+    shown = f"rows of {count + 1} cells without headings, among lines of other text"
+    columns = {f"#{i + 1}": [row[i].strip() for row in table] for i in range(count + 1)}
+    seen = _fitting(path, (*likely, shown), columns)
+    return UnknownFile(path, (*seen.seen, "delete the other lines to describe the columns"))
 
 
 def _number(text: str) -> float | None:

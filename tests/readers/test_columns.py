@@ -149,6 +149,13 @@ def test_what_is_seen(tmp_path, content, seen):
     assert seen in describe_unknown(tmp_path / "log.dat").one_line()
 
 
+def test_rows_amid_other_text(tmp_path):
+    path = tmp_path / "x.txt"
+    path.write_text("logger v3\nrate  25\nstart\n" + "".join(f"1,{i * 20},{i % 3},5\n" for i in range(20)))
+    seen = describe_unknown(path).one_line()
+    assert "rows of 4 cells without headings, among lines of other text" in seen and "#2 may be the time in ms" in seen
+
+
 def test_folders(tmp_path):
     assert describe_unknown(tmp_path).seen == ("an empty folder",)
     (tmp_path / "a.dat").write_bytes(b"ULog\x01")

@@ -123,7 +123,7 @@ def row_stamps(table: TextTable, path: Path) -> tuple[Times, Mask, str]:
         raise SessionError(path, f"has no column of stamps among {', '.join(table.cells)}", "time", remedy)
     known = table.known(column)
     rows = table if known.all() else table.rows(known)
-    first = str(rows.texts(column)[0])
+    first = str(rows.cells[column][0].as_py())
     if _CLOCK.fullmatch(first):
         return _times_of_day(rows, column), known, "unknown"
     if is_date(first):
