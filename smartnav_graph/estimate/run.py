@@ -29,6 +29,7 @@ from smartnav_graph.estimate.result.assemble import (
     used_counts,
 )
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
+from smartnav_graph.estimate.result.score_tests import unmodelled
 from smartnav_graph.estimate.result.summary import summarise
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.prior import PriorBuilder
@@ -146,10 +147,14 @@ def _finish(
 ) -> Run:
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     keyframes = to_solution(solved)
+    # States that left a lag one after the other were never solved together: their residuals say nothing of the data.
+    looked_at = unmodelled(solved) if causal is None or "polish" in extra else None
+    if looked_at is not None:
+        keyframes = replace(keyframes, covariance=keyframes.covariance + looked_at.covariance())
     withheld = score_holdout(problem, keyframes, estimate)
     solution = resample(problem, keyframes)
     clock.lap("assemble")
-    summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra)
+    summary = summarise(solved, initial, keyframes, withheld, clock.to_dict(), extra, looked_at)
     diagnostics = Diagnostics.of(problem, estimate, pass_state, updates)
     return Run(problem, solution, summary, causal, withheld, (), diagnostics, estimate, pass_state)
 

@@ -190,9 +190,13 @@ class PositionBuilder(Builder):
         if not (self.noise.is_correlated and self.config.correlated):
             return False
         typical = float(np.median(self.scaled_sigma(pass_state)[self.typical, :2]))
-        stated = float(self.own_sigma[self.typical].mean()) > 0.5
         known = self.name in pass_state.correlated
-        return known or typical >= CARRIER_PHASE_SIGMA or (doubtful and not stated)
+        return known or typical >= CARRIER_PHASE_SIGMA or (doubtful and not self.has_sigmas)
+
+    @property
+    def has_sigmas(self) -> bool:
+        """Whether most rows came with a sigma of their own."""
+        return float(self.own_sigma[self.typical].mean()) > 0.5
 
     @property
     def measures_height(self) -> Mask:

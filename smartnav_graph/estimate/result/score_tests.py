@@ -1,38 +1,38 @@
-"""Errors of sensors that have no state: how large each would be if it had one, by the residuals of the solution.
+"""Errors of sensors that have no state: how large each would be if it had one, by the residuals of the solution, and
+how far they may move it (`smoothers.sensitivity`).
 
-With whitened residuals r and Jacobian A of all factors at the solution, and the derivatives J of r by some errors x,
+Tested one by one are the clock offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of
+accelerometer and gyroscope, and the focal length of the camera; where several sensors measure the position, an offset
+of each to the others. Errors that a class of devices has, and no state takes, are in the covariance (consider
+covariance): with their prior D, information I and score s by the data,
 
-    x = -(J^T M J)^-1 J^T M r      cov x = (J^T M J)^-1      M = 1 - A (A^T A)^-1 A^T
+    m = C s      C = (I + D^-1)^-1      P <- P + S (C + m m^T) S^T
 
-is what one more iteration of least squares with x as states without priors finds. Tested one by one are the clock
-offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of accelerometer and gyroscope, and
-the focal length of the camera; where several sensors measure the position, an offset of each to the others.
+where S is the change of the states by each error, which the solution does not correct.
 
-Source: Foerstner, Wrobel (2016), Photogrammetric Computer Vision, 4.6.4; Rao (1973), Linear statistical inference, 6e.
+Source: Rao (1973), Linear statistical inference, 6e; Schmidt (1966), Advances in Control Systems 3, 293.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
-import gtsam
 import numpy as np
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.core.so3 import log
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.factors.coplanar_rows import CompressedRows
-from smartnav_graph.factors.imu import ImuBuilder
-from smartnav_graph.graph.states import key, kind_of
-from smartnav_graph.graph.update import FactorId, one_of
-from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.redundancy import CALIBRATION
-from smartnav_graph.smoothers.whole_graph import Snapshot, WholeGraph
+from smartnav_graph.factors.imu import CLASS_WEIGHT, ImuBuilder
+from smartnav_graph.graph.states import key
+from smartnav_graph.graph.update import one_of
+from smartnav_graph.smoothers.sensitivity import Derivatives, LinearSystem, Part, Sensitivity
+from smartnav_graph.smoothers.whole_graph import Snapshot
 
 # Parts of the fixes between which a clock may jump, and the least number of fixes that are tested.
 PARTS, LEAST_FIXES = 10, 6
@@ -42,14 +42,22 @@ LEAST_LEFT = 1e-6
 EXCITED = 250.0
 # Factors of image pairs, and a small relative change of the focal length.
 PAIRS, FOCAL_STEP = "image_pairs", 1e-4
+# Errors of a class of devices: scale factors, of each axis by itself and of all axes of a sensor alike (voltage,
+# temperature, clock), and rate by specific force, rad/s / (m/s^2).
+SCALE_SIGMA, COMMON_SCALE_SIGMA = 0.002, 0.006
+G_SENSITIVITY_SIGMA = float(np.radians(0.02)) / STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
 class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
     stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale`` and ``gyro
-    scale`` along the body axis `axis`; ``focal length`` (relative); ``offset`` (m) of its positions to the east,
-    north or up."""
+    scale`` along the body axis `axis`; ``g-sensitivity`` of the gyro axis by the force along another, rad/s / (m/s^2);
+    ``focal length`` (relative); ``offset`` (m) of its positions to the east, north or up.
+
+    prior_sigma : of what devices of the class have, zero where it is not in the covariance; shows : whether the data
+    can say of it
+    """
 
     sensor: str
     kind: str
@@ -57,95 +65,64 @@ class SensorError:
     t_ns: int | None = None
     value: float = 0.0
     sigma: float = np.inf
+    prior_sigma: float = 0.0
+    shows: bool = True
 
 
-def sensor_errors(solved: SolvedProblem) -> list[SensorError]:
-    """Every error that the data determine."""
-    names, linear = _linearized(solved.estimate)
-    parts = _parts(names, linear, {*solved.fixes, "imu", PAIRS})
+class Unmodelled(NamedTuple):
+    """Errors without a state, what the data say of them, and the change (n, 15, k) of the keyframes by each."""
+
+    errors: Sequence[SensorError]
+    found: Sensitivity
+    change: Floats
+
+    def covariance(self) -> Floats:
+        """What they add to the covariance (n, 15, 15) of the keyframes."""
+        sigma, kind = (np.array([getattr(error, name) for error in self.errors]) for name in ("prior_sigma", "kind"))
+        own = np.flatnonzero(sigma)
+        common = np.array([COMMON_SCALE_SIGMA if name.endswith("scale") else 0.0 for name in kind[own]])
+        prior = np.diag(sigma[own] ** 2) + np.outer(common, common) * (kind[own, None] == kind[own])
+        left = np.linalg.solve(np.eye(len(own)) + prior @ self.found.information[np.ix_(own, own)], prior)
+        middle = left @ self.found.score[own]
+        change = self.change[:, :, own]
+        return np.asarray(change @ (left + np.outer(middle, middle)) @ change.transpose(0, 2, 1))
+
+
+def unmodelled(solved: SolvedProblem) -> Unmodelled | None:
+    """Every error that is looked at; None where there is none."""
+    linear = LinearSystem(solved.estimate)
+    parts = linear.parts({*solved.fixes, "imu", PAIRS})
     found = [*_of_positions(solved, parts), *_of_inertial_data(solved, parts), *_of_images(solved, parts)]
     if not found:
+        return None
+    sensitivity = linear.sensitivity([rows for _, rows in found])
+    return Unmodelled([error for error, _ in found], sensitivity, linear.keyframes(sensitivity.change))
+
+
+def sensor_errors(looked_at: Unmodelled | None) -> list[SensorError]:
+    """Every error that the data determine, by itself or beside a clock offset."""
+    if looked_at is None:
         return []
-    i, j, value = linear.sparseJacobian_()
-    whole = csc_array((value, (i.astype(np.intp) - 1, j.astype(np.intp) - 1)))
-    A, b = whole[:, :-1], whole[:, [-1]].toarray()[:, 0]
-    J = np.zeros((len(b), len(found)))
-    for k, (_, rows) in enumerate(found):
-        for first, derivative in rows:
-            J[first : first + len(derivative), k] = derivative
-    cross = np.asarray(A.T @ J)
-    normal = splu((A.T @ A).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    fitted = cross.T @ normal.solve(np.column_stack([cross, A.T @ b]))
-    information, score, power = J.T @ J - fitted[:, :-1], J.T @ b - fitted[:, -1], (J**2).sum(axis=0)
-    known = np.diag(information) > LEAST_LEFT * power
-    errors, constant = list[SensorError](), 0
+    found, errors, constant = looked_at.found, list[SensorError](), 0
+    known = (found.left > LEAST_LEFT) & [error.shows for error in looked_at.errors]
     for k in np.flatnonzero(known).tolist():
-        error = found[k][0]
+        error = looked_at.errors[k]
         constant = k if error.kind == "clock" else constant
         beside = error.kind in ("clock rate", "clock jump", "lever arm") and known[constant]
         own = np.array([k, constant] if beside else [k])
-        covariance = np.linalg.pinv(information[np.ix_(own, own)], hermitian=True)
-        value, variance = float(covariance[0] @ score[own]), float(covariance[0, 0])
+        covariance = np.linalg.pinv(found.information[np.ix_(own, own)], hermitian=True)
+        value, variance = float(covariance[0] @ found.score[own]), float(covariance[0, 0])
         errors.append(replace(error, value=value, sigma=float(np.sqrt(variance))))
     return errors
 
 
-def _linearized(estimate: Estimate) -> tuple[list[FactorId], gtsam.GaussianFactorGraph]:
-    """Every factor in use, and the linear system of them in that order."""
-    priors = [
-        gtsam.PriorFactorVector(state.key, state.prior_mean, gtsam.noiseModel.Diagonal.Sigmas(state.prior_sigma))
-        for state in estimate.session.values()
-        if not state.held
-    ]
-    graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, estimate.held)
-    names = [factor for factor, _ in estimate.factors] + [FactorId(CALIBRATION, 0)] * len(priors)
-    for stack in graph.stacks:
-        pairs = zip(stack.t_ns[stack.used].tolist(), stack.rows[stack.used].tolist(), strict=True)
-        names += [FactorId(stack.sensor, t_ns, row) for t_ns, row in pairs]
-    return names, graph.linearize(estimate.values)
-
-
-# First row and derivatives (m,) of the residuals of some factors.
-Derivatives = Sequence[tuple[int, Floats]]
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A linear factor: its first row, and its derivatives (m, d) by state."""
-
-    name: FactorId
-    row: int
-    by_state: Mapping[int, Floats]
-
-
-def _parts(names: Sequence[FactorId], linear: Any, sensors: Collection[str]) -> list[_Part]:
-    found, row = list[_Part](), 0
-    for i, name in enumerate(names):
-        factor = linear.at(i)
-        if factor is None or factor.empty():
-            continue
-        A, right = factor.jacobian()
-        if name.sensor in sensors:
-            at, by_state = 0, dict[int, Floats]()
-            for state in factor.keys():  # noqa: SIM118
-                width = kind_of(state).dim
-                by_state[state] = A[:, at : at + width]
-                at += width
-            found.append(_Part(name, row, by_state))
-        row += len(right)
-    return found
-
-
-def _of_positions(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_positions(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
     estimate = solved.estimate
     R, _, v, _ = estimate.states()
-    pose = {key("X", index): k for k, index in enumerate(estimate.indices)}
+    place = {index: k for k, index in enumerate(estimate.indices)}
     for sensor in solved.fixes:
-        rows = []
-        for part in parts:
-            states = [state for state in part.by_state if state in pose]
-            if part.name.sensor == sensor and len(states) == 1:
-                rows.append((part, part.by_state[states[0]][:, 3:6], pose[states[0]]))  # by the position, body axes
+        poses = [(part, part.pose()) for part in parts if part.name.sensor == sensor]
+        rows = [(part, pose[1], place[pose[0]]) for part, pose in poses if pose is not None]
         if len(rows) < LEAST_FIXES:
             continue
         moved = [(part.row, W @ R[k].T @ v[k]) for part, W, k in rows]
@@ -162,33 +139,46 @@ def _of_positions(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tup
                 yield SensorError(sensor, "offset", ("east", "north", "up")[axis]), shifted
 
 
-def _of_inertial_data(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tuple[SensorError, Derivatives]]:
-    """A scale acts as a bias in proportion to the mean reading of a window. Where noise is what makes these means vary,
-    they are no measure of the motion."""
+def _of_inertial_data(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+    """An error in proportion to a reading acts as a bias in proportion to its mean over a window, by the solution. That
+    of the mean specific force is a bias. Where noise is what makes these means vary, they are no measure of the motion.
+    """
+    imu, estimate = one_of(solved.problem.builders, ImuBuilder), solved.estimate
     windows = {window.t1_ns: window for window in solved.problem.windows if window.kind == "normal"}
-    bias = {key("B", index) for index in solved.estimate.indices}
-    rows = [
-        (part.row, next(J for state, J in part.by_state.items() if state in bias), windows[part.name.t_ns])
-        for part in parts
-        if part.name.sensor == "imu" and part.name.t_ns in windows
-    ]
-    imu = one_of(solved.problem.builders, ImuBuilder)
+    place = {key("B", index): k for k, index in enumerate(estimate.indices[:-1])}
+    inertial = [part for part in parts if part.name.sensor == "imu" and part.name.t_ns in windows]
+    rows = [(part.row, part.by_state[b], place[b]) for part in inertial for b in part.by_state if b in place]
     if imu is None or not rows:
         return
-    length_s = np.array([window.length_s for _, _, window in rows])
+    R, _, v, _ = estimate.states()
+    known = imu.weight != CLASS_WEIGHT or imu.config.scale_sigma > 0
+    scale_sigma, sensitivity_sigma = (0.0, 0.0) if known else (SCALE_SIGMA, G_SENSITIVITY_SIGMA)
+    first = np.array([k for _, _, k in rows])
+    length_s = np.diff(estimate.t_ns)[first, None] / NS
+    turned = log(R[first].transpose(0, 2, 1) @ R[first + 1]) / length_s
+    accel = (v[first + 1] - v[first]) / length_s + [0.0, 0.0, solved.problem.session.gravity]
+    force = np.einsum("nji,nj->ni", 0.5 * (R[first] + R[first + 1]), accel)
+    force -= force.mean(axis=0)
+
+    def directions(bias: int, reading: Floats) -> Derivatives:
+        return [(row, by[:, bias] * one) for (row, by, _), one in zip(rows, reading.tolist(), strict=True)]
+
     kinds = (
-        ("accelerometer scale", "accel", imu.noise.accel_noise_density * solved.pass_state.scale("accel"), 0),
-        ("gyro scale", "gyro", imu.noise.gyro_noise_density * solved.pass_state.scale("gyro"), 3),
+        ("accelerometer scale", force, imu.noise.accel_noise_density * solved.pass_state.scale("accel"), 0),
+        ("gyro scale", turned, imu.noise.gyro_noise_density * solved.pass_state.scale("gyro"), 3),
     )
-    for kind, field, density, column in kinds:
-        mean = np.array([w.dt @ getattr(w, field) / w.dt.sum() for _, _, w in rows])
-        varies = np.var(mean, axis=0) > EXCITED * density**2 * float(np.mean(1.0 / length_s))
-        for axis in np.flatnonzero(varies):
-            derivatives = [(row, J[:, column + axis] * mean[k, axis]) for k, (row, J, _) in enumerate(rows)]
-            yield SensorError("imu", kind, "xyz"[axis]), derivatives
+    for kind, reading, density, bias in kinds:
+        varies = np.var(reading, axis=0) > EXCITED * density**2 * float(np.mean(1.0 / length_s))
+        for axis in range(3):
+            error = SensorError("imu", kind, "xyz"[axis], prior_sigma=scale_sigma, shows=bool(varies[axis]))
+            yield error, directions(bias + axis, reading[:, axis])
+    for gyro in range(3):
+        for axis in range(3):
+            error = SensorError("imu", "g-sensitivity", "xyz"[gyro], prior_sigma=sensitivity_sigma, shows=False)
+            yield error, directions(3 + gyro, force[:, axis])
 
 
-def _of_images(solved: SolvedProblem, parts: Sequence[_Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_images(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
     """Directions by a focal length that is too small are too far from the axis: x (1 + f), y (1 + f) in every match,
     which is vec(E) with its entries multiplied by 1, 1 + f or (1 + f)^2."""
     by_pair = {part.name.row: part.row for part in parts if part.name.sensor == PAIRS}

@@ -17,6 +17,7 @@ from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld, used_counts
 from smartnav_graph.estimate.result.chi2 import chi2_of
 from smartnav_graph.estimate.result.rejections import rejections
+from smartnav_graph.estimate.result.score_tests import Unmodelled
 from smartnav_graph.estimate.result.verdict import VerdictInputs, verdict
 from smartnav_graph.estimate.reweight.false_standstills import refuted_text
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
@@ -78,6 +79,7 @@ def summarise(
     withheld: Mapping[str, Withheld],
     timings: Mapping[str, float],
     extra: Mapping[str, Any],
+    looked_at: Unmodelled | None = None,
 ) -> dict[str, Any]:
     """The content of summary.json; `extra` overrides and adds."""
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
@@ -96,7 +98,7 @@ def summarise(
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
     summary: dict[str, Any] = {
-        "verdict": verdict(VerdictInputs(solved, fit, withheld, together)),
+        "verdict": verdict(VerdictInputs(solved, fit, withheld, together, looked_at)),
         "mode": mode,
         "vehicle": problem.vehicle,
         "session": _session(problem.session),

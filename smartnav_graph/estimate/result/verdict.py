@@ -23,9 +23,10 @@ from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
 from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
 from smartnav_graph.estimate.result.left_out import left_out
-from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
+from smartnav_graph.estimate.result.score_tests import SensorError, Unmodelled, sensor_errors
 from smartnav_graph.estimate.reweight.image_pair_outliers import pair_account
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
+from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
@@ -128,6 +129,7 @@ class VerdictInputs:
     fit: Chi2
     withheld: Mapping[str, Withheld]
     together: bool
+    unmodelled: Unmodelled | None = None
 
     @property
     def on_foot(self) -> bool:
@@ -210,10 +212,23 @@ def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
     """Fixes without sigmas that agree with each other, but with the inertial data only by a correlated error."""
     for builder in position_builders(inputs.solved.problem.builders):
         sigma = float(np.median(builder.scaled_sigma(inputs.solved.pass_state)[:, :2]))
-        if builder.name in inputs.solved.pass_state.correlated and sigma < CARRIER_PHASE_SIGMA:
+        found = builder.name in inputs.solved.pass_state.correlated and not builder.has_sigmas
+        if found and sigma < CARRIER_PHASE_SIGMA:
             text = f"fixes agree with each other to {sigma:.2f} m, but not so with the inertial data"
             remedy = "they may be filtered, or a lever arm, scale or height wrong; give sigmas where they are right"
+            yield Reason(LEVELS[1], builder.name, text, remedy, sigma)
 
+
+def _lasting(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Errors that last, of fixes whose sigmas or calibration say that they have none."""
+    builders, pass_state = inputs.solved.problem.builders, inputs.solved.pass_state
+    silent = lasting_errors(builders, inputs.solved.estimate, pass_state) if inputs.together else frozenset[str]()
+    for builder in position_builders(builders):
+        sigma = float(np.median(builder.scaled_sigma(pass_state)[:, :2]))
+        joined = builder.has_sigmas and builder.name in pass_state.correlated and sigma < CARRIER_PHASE_SIGMA
+        if joined or builder.name in silent:
+            text = f"errors of fixes with sigmas of {sigma:.2g} m last for many fixes, and the solution follows them"
+            remedy = "the sigmas may be those of their noise alone: give larger ones, or the correlated error"
             yield Reason(LEVELS[1], builder.name, text, remedy, sigma)
 
 
@@ -232,7 +247,7 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
     worst: dict[str, SensorError] = {}
     misfit = inputs.fit.per_dof()
     session = inputs.solved.problem.session
-    for error in sensor_errors(inputs.solved) if inputs.together else ():
+    for error in sensor_errors(inputs.unmodelled) if inputs.together else ():
         limit = LIMITS[error.kind]
         error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
@@ -362,8 +377,8 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
 
 # What names a cause comes before what it makes of the solution.
 TESTS: tuple[Test, ...] = (
-    *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _images, _biases),
-    *(_alike, _two_places, _predictions, _left_out, _solver),
+    *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _lasting, _images),
+    *(_biases, _alike, _two_places, _predictions, _left_out, _solver),
 )
 # What compares positions with inertial data says nothing of a motion model.
 POSITIONS_ONLY: tuple[Test, ...] = (_recording, _misfits, _rejected, _alike, _solver)

@@ -23,6 +23,7 @@ from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
 from smartnav_graph.estimate.reweight.imu_noise import RELAXATION, noise_scales, worse_than_class
+from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
 from smartnav_graph.estimate.reweight.outliers import (
     FixResiduals,
     Verdict,
@@ -197,6 +198,8 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
+    lasting = lasting_errors(builders, estimate, replace(pass_state, correlated=pass_state.correlated | correlated))
+    correlated |= {builder.name for builder in positions if builder.name in lasting and builder.noise.is_correlated}
     blind = {
         state.name: state.prior_mean
         for state in estimate.session.values()
