@@ -34,7 +34,7 @@ Derivatives = Sequence[tuple[int, Floats]]
 
 
 @dataclass(frozen=True)
-class Part:
+class LinearPart:
     """A linear factor: its first row, and its derivatives (m, d) by state."""
 
     name: FactorId
@@ -78,9 +78,9 @@ class LinearSystem:
             self._names += [FactorId(stack.sensor, t_ns, row) for t_ns, row in pairs]
         self._linear, self._estimate = graph.linearize(estimate.values), estimate
 
-    def parts(self, sensors: Collection[str]) -> list[Part]:
+    def parts(self, sensors: Collection[str]) -> list[LinearPart]:
         """The factors of some sensors."""
-        found, row = list[Part](), 0
+        found, row = list[LinearPart](), 0
         for i, name in enumerate(self._names):
             factor = self._linear.at(i)
             if factor is None or factor.empty():
@@ -92,7 +92,7 @@ class LinearSystem:
                     width = kind_of(state).dim
                     by_state[state] = A[:, at : at + width]
                     at += width
-                found.append(Part(name, row, by_state))
+                found.append(LinearPart(name, row, by_state))
             row += len(right)
         return found
 

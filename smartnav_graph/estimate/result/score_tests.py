@@ -31,7 +31,7 @@ from smartnav_graph.factors.coplanar_rows import CompressedRows
 from smartnav_graph.factors.imu import CLASS_WEIGHT, ImuBuilder
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import one_of
-from smartnav_graph.smoothers.sensitivity import Derivatives, LinearSystem, Part, Sensitivity
+from smartnav_graph.smoothers.sensitivity import Derivatives, LinearPart, LinearSystem, Sensitivity
 from smartnav_graph.smoothers.whole_graph import Snapshot
 
 # Parts of the fixes between which a clock may jump, and the least number of fixes that are tested.
@@ -116,7 +116,7 @@ def sensor_errors(looked_at: Unmodelled | None) -> list[SensorError]:
     return errors
 
 
-def _of_positions(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_positions(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
     estimate = solved.estimate
     R, _, v, _ = estimate.states()
     place = {index: k for k, index in enumerate(estimate.indices)}
@@ -139,7 +139,7 @@ def _of_positions(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tupl
                 yield SensorError(sensor, "offset", ("east", "north", "up")[axis]), shifted
 
 
-def _of_inertial_data(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
     """An error in proportion to a reading acts as a bias in proportion to its mean over a window, by the solution. That
     of the mean specific force is a bias. Where noise is what makes these means vary, they are no measure of the motion.
     """
@@ -178,7 +178,7 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[
             yield error, directions(3 + gyro, force[:, axis])
 
 
-def _of_images(solved: SolvedProblem, parts: Sequence[Part]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_images(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
     """Directions by a focal length that is too small are too far from the axis: x (1 + f), y (1 + f) in every match,
     which is vec(E) with its entries multiplied by 1, 1 + f or (1 + f)^2."""
     by_pair = {part.name.row: part.row for part in parts if part.name.sensor == PAIRS}

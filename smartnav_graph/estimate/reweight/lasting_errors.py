@@ -23,7 +23,7 @@ from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.sensitivity import LinearSystem, Part, Sensitivity
+from smartnav_graph.smoothers.sensitivity import LinearPart, LinearSystem, Sensitivity
 
 # Errors that are looked for: amplitude in units of the stated sigmas, and correlation time, s.
 LASTING = ((1.0, 10.0), (2.0, 20.0))
@@ -51,7 +51,7 @@ def lasting_errors(builders: Iterable[Builder], estimate: Estimate, pass_state: 
 
 
 def _evidence(
-    builder: PositionBuilder, linear: LinearSystem, parts: list[Part], estimate: Estimate, pass_state: PassState
+    builder: PositionBuilder, linear: LinearSystem, parts: list[LinearPart], estimate: Estimate, pass_state: PassState
 ) -> float:
     """Largest logarithm of the Bayes factors of `LASTING`, horizontal errors and those of heights that count."""
     poses = [(part, part.pose()) for part in parts if part.name.sensor == builder.name]

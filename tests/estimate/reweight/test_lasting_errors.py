@@ -10,7 +10,7 @@ from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.run import smooth
 from smartnav_graph.factors.gnss import GnssConfig
 
-STATED, WANDER, LASTS_S = 0.3, 1.0, 60.0  # m, m, s
+STATED, AMPLITUDE, LASTS_S = 0.3, 1.0, 60.0  # m, m, s
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +19,10 @@ def eight():
 
 
 @pytest.fixture(scope="module")
-def wandering(eight):
+def correlated(eight):
     """The same fixes with a Gauss-Markov error that their sigmas do not have."""
     rng, phi = np.random.default_rng(3), np.exp(-1.0 / LASTS_S)
-    error = WANDER * rng.standard_normal((len(eight.gnss), 3))
+    error = AMPLITUDE * rng.standard_normal((len(eight.gnss), 3))
     for k in range(1, len(error)):
         error[k] = phi * error[k - 1] + np.sqrt(1.0 - phi**2) * error[k]
     return with_gnss(eight, lla=eight.frame.lla_from_nav(eight.nav_position(eight.gnss) + error))
@@ -38,22 +38,22 @@ def test_white_fixes_have_none(eight):
     assert not run.pass_state.correlated
 
 
-def test_they_are_a_reason_where_the_calibration_excludes_them(wandering):
-    run = smooth(wandering)
+def test_they_are_a_reason_where_the_calibration_excludes_them(correlated):
+    run = smooth(correlated)
     assert lasting(run)
     assert not run.pass_state.correlated
 
 
-def test_they_have_a_state_where_the_class_has_them(wandering):
+def test_they_have_a_state_where_the_class_has_them(correlated):
     """The sigma of the position covers what the fixes do not show: the mean of their error."""
-    run = smooth(wandering.replace(calibration=None))
+    run = smooth(correlated.replace(calibration=None))
     assert lasting(run) and run.pass_state.correlated == {"gnss"}
-    known = np.isin(run.solution.t_ns, wandering.reference.t_ns)
-    position = truth(wandering, run.solution.t_ns[known])[1]
+    known = np.isin(run.solution.t_ns, correlated.reference.t_ns)
+    position = truth(correlated, run.solution.t_ns[known])[1]
     covered = np.abs(run.solution.nav_t_body[known] - position) < 2.0 * run.solution.sigmas[known, 3:6]
     assert covered.mean() > 0.9
 
 
-def test_none_are_looked_for_where_correlated_errors_are_switched_off(wandering):
-    run = smooth(wandering, Config(gnss=GnssConfig(correlated=False)))
+def test_none_are_looked_for_where_correlated_errors_are_switched_off(correlated):
+    run = smooth(correlated, Config(gnss=GnssConfig(correlated=False)))
     assert not lasting(run) and not run.pass_state.correlated
