@@ -85,6 +85,12 @@ KINDS: dict[str, CalibrationKind] = {
         "hard and soft iron, strength, turn to the accelerometer",
         "smartnav calibrate magnetometer turns --out calibration.toml",
     ),
+    "clock": CalibrationKind(
+        "clock",
+        "ClockOptions",
+        "rate and jitter of samples; offset and drift between two clocks",
+        "smartnav calibrate clock session --claimed-hz 100 --out calibration.toml",
+    ),
     "static": CalibrationKind(
         "static",
         "StaticOptions",
