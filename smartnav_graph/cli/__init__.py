@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from smartnav_graph.core import interrupts
 from smartnav_graph.core.errors import SmartnavError
+from smartnav_graph.core.text import inert
 
 if TYPE_CHECKING:
     from smartnav_graph.cli.options import Command
@@ -110,6 +111,13 @@ def _run(name: str, rest: list[str]) -> int:
         return exit.code if isinstance(exit.code, int) else 2
 
 
+class _Inert(logging.Formatter):
+    """Messages without escapes of the terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return inert(super().format(record))
+
+
 def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
     from smartnav_graph.cli.help import help_text
     from smartnav_graph.cli.options import parse
@@ -123,7 +131,9 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
                 print(help_text(kind, name, everything="--help-all" in asked))
                 return 0
             command = parse(kind, name, rest)
-            logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, format="%(message)s")
+            handler = logging.StreamHandler()
+            handler.setFormatter(_Inert("%(message)s"))
+            logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, handlers=[handler])
             return command.run() or 0
         except (SmartnavError, BrokenPipeError, SystemExit):
             raise

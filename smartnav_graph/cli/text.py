@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
+from smartnav_graph.core.text import inert
 from smartnav_graph.output.summary_json import (
     Summary,
     imu_gaps,
@@ -34,7 +35,7 @@ STYLES = {
 def print_findings(text: str) -> None:
     """Lines on stdout, coloured by severity on a terminal."""
     console = Console(soft_wrap=True, highlight=False)
-    for line in text.splitlines():
+    for line in inert(text).splitlines():
         console.print(Text(line, style=STYLES.get(line.split(" ", 1)[0], "")))
 
 
@@ -48,7 +49,7 @@ def session_text(session: Session) -> str:
     ]
     for name, counts in session.dropped.items():
         lines += [f"repaired: {name}: {count} {reason}" for reason, count in counts.items()]
-    return "\n".join(lines)
+    return inert("\n".join(lines))
 
 
 def run_text(summary: Summary, out: Path) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Self
 
+from smartnav_graph.core.text import inert
+
 
 class SmartnavError(Exception):
     """Base of every named input or solver fault.
@@ -49,7 +51,7 @@ class SmartnavError(Exception):
             parts.append(f"expected {expected}")
         if remedy:
             parts.append(remedy)
-        super().__init__("; ".join(parts))
+        super().__init__(inert("; ".join(parts)))
 
     def located(self, where: str | Path) -> Self:
         """The same fault with the file it was read from."""

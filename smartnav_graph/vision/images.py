@@ -7,6 +7,7 @@ at another size, when it is dark, blurred beyond the rest of the recording, or t
 from __future__ import annotations
 
 import hashlib
+import io
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -109,6 +110,8 @@ def open_picture(picture: Picture, camera: Camera | None) -> OpenedPicture:
         data = picture.path.read_bytes()
     except OSError:
         return OpenedPicture(fault=MISSING)
+    if _claimed_size(data) not in (None, (camera.width, camera.height)):  # before it is decoded: it may be huge
+        return OpenedPicture(fault=RESIZED)
     gray = decoded(data)
     if gray is None:
         return OpenedPicture(fault=BROKEN)
@@ -118,6 +121,19 @@ def open_picture(picture: Picture, camera: Camera | None) -> OpenedPicture:
     if high - low < LEAST_CONTRAST:
         return OpenedPicture(fault=DARK)
     return OpenedPicture(gray, "", sharpness(gray), hashlib.blake2b(gray.tobytes(), digest_size=16).digest())
+
+
+def _claimed_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the heading of a picture gives; None where it is of a kind that Pillow does not know."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            return picture.size
+    except Image.DecompressionBombError:
+        return (0, 0)
+    except (OSError, ValueError, SyntaxError, MemoryError):
+        return None
 
 
 def decoded(data: bytes) -> Gray | None:

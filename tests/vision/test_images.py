@@ -138,3 +138,17 @@ def test_a_session_without_pictures_is_reported(tmp_path):
     for other in (session.replace(images=nameless), session.replace(pictures=None)):
         with pytest.raises(SessionError, match="lists images, but no files of them"):
             images.pictures(other)
+
+
+def test_a_picture_that_claims_to_be_huge_is_not_decoded(tmp_path, monkeypatch):
+    import zlib
+
+    from smartnav_graph.session.calibration.camera import Camera
+
+    heading = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + bytes([8, 0, 0, 0, 0])
+    chunk = (13).to_bytes(4, "big") + heading + zlib.crc32(heading).to_bytes(4, "big")
+    rows = (4).to_bytes(4, "big") + b"IDAT" + bytes(8)
+    (tmp_path / "huge.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + rows)
+    monkeypatch.setattr(images, "decoded", lambda data: pytest.fail("decoded"))
+    picture = Picture(0, 0, "cam0", "huge.png", tmp_path / "huge.png")
+    assert images.open_picture(picture, Camera(640, 480, 500.0, 500.0, 320.0, 240.0)).fault == images.RESIZED

@@ -254,4 +254,6 @@ def _table(rows: list[tuple[Picture, Place]], path: Path) -> None:
         for picture, place in rows:
             values = [getattr(place, name) for name in names]
             cells = [v if d is None else f"{v:.{d}f}" for v, d in zip(values, digits, strict=True)]
-            write((picture.file, *("" if cell == "nan" else cell for cell in cells)))
+            # a name that a spreadsheet would take for a formula
+            name = f"./{picture.file}" if picture.file[0] in "=+-@" else picture.file
+            write((name, *("" if cell == "nan" else cell for cell in cells)))
