@@ -61,6 +61,12 @@ KINDS: dict[str, CalibrationKind] = {
         "smartnav calibrate camera pictures/ --board chessboard:9x6:0.025 --out calibration.toml --report camera.html",
         paths=True,
     ),
+    "camera-imu": CalibrationKind(
+        "camera_imu",
+        "CameraImuOptions",
+        "clock, turn and rolling shutter of a camera against the gyroscope",
+        "smartnav calibrate camera-imu walk --out calibration.toml --report camera-imu.html",
+    ),
     "accelerometer": CalibrationKind(
         "accelerometer",
         "AccelerometerOptions",

@@ -8,11 +8,9 @@ Least squares over theta and the pose of every view v; the poses are eliminated,
 
 A_v, B_v : derivatives of the pixels of a view by theta and by its pose; s^2 : sum of squared residuals over degrees of
 freedom. Errors within a view are not independent (blur, a board that is not flat, a model that does not fit): the
-covariance is raised to what the scatter of the sums A' r between views shows, each corrected for its leverage. With few
-views that is known on average only: f, its mean over all directions, is blended with the scatter of each.
+covariance is raised to what the scatter between views shows (`core.clustered`).
 
-Source: Zhang (2000), A flexible new technique for camera calibration; Bell, McCaffrey (2002), Bias reduction in
-standard errors for linear regression with multi-stage samples (the correction for leverage).
+Source: Zhang (2000), A flexible new technique for camera calibration.
 """
 
 from __future__ import annotations
@@ -26,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.clustered import clustered_covariance
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.so3 import exp
 from smartnav_graph.session.calibration.camera import Camera
@@ -83,7 +82,7 @@ class CameraFit:
 
     model : one of `MODELS`; theta (p,), covariance (p, p) by `names`; poses (v, 6) : rotation vector and position of
     the board in camera axes, m; views, residuals : observed less projected, px, of each view
-    noise_px : of one coordinate of a corner; inflation : f above, 1 for independent errors
+    noise_px : of one coordinate of a corner; inflation : of variances by errors that are not independent, 1 for none
     left_out : name of a view, reason
     """
 
@@ -191,21 +190,6 @@ def minimise_views(
     return theta, poses, now
 
 
-def scatter_of_views(normal: Normal, variance: float) -> Floats:
-    """Covariance (p, p) of theta by the scatter of the sums A' r of views, from that of independent errors up."""
-    inverse = np.linalg.inv(normal.S)
-    L = np.linalg.cholesky(0.5 * (inverse + inverse.T))
-    M, p, count = np.zeros_like(L), len(L), len(normal.residuals)
-    for A_v, r in zip(normal.reduced, normal.residuals, strict=True):
-        share, axes = np.linalg.eigh(L.T @ A_v.T @ A_v @ L)
-        u = axes @ ((axes.T @ (L.T @ A_v.T @ r.ravel())) / np.sqrt(np.maximum(1.0 - share, 0.05)))
-        M += np.outer(u, u) / variance
-    f = max(1.0, np.trace(M) / p)
-    own = (1.0 - 1.0 / f) * count / (count + p)
-    values, axes = np.linalg.eigh((1.0 - own) * f * np.eye(p) + own * M)
-    return np.asarray(variance * L @ (axes * np.maximum(values, 1.0)) @ axes.T @ L.T)
-
-
 def _fit(model: str, size: tuple[int, int], views: Sequence[BoardView], theta: Floats, poses: Floats) -> CameraFit:
     theta, poses, normal = minimise_views(model, theta, poses, views)
     names = (*PINHOLE, *MODELS[model])
@@ -221,7 +205,8 @@ def _fit(model: str, size: tuple[int, int], views: Sequence[BoardView], theta: F
     step = axes[:, 0] / scale / np.sqrt(values[0] / variance)  # one sigma in the direction that is known least
     if not _is_linear(model, theta, poses, views, normal, step, variance):
         raise _open_term(model, worst)
-    covariance = scatter_of_views(normal, variance)
+    scores = np.array([A.T @ r.ravel() for A, r in zip(normal.reduced, normal.residuals, strict=True)])
+    covariance = clustered_covariance(np.array([A.T @ A for A in normal.reduced]), scores, variance)
     f = float(np.trace(covariance @ normal.S)) / (variance * len(theta))
     residuals = tuple(normal.residuals)
     return CameraFit(model, *size, theta, covariance, poses, tuple(views), residuals, float(np.sqrt(variance)), f)

@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from smartnav_graph.calibrate import KINDS, calibrate_into
+from smartnav_graph.cli.calibrate_camera import PrintBoard, Undistort, camera_differences
 from smartnav_graph.cli.options import Command, Reporting, SourceName, Switch, Writing
 from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import ConfigError
@@ -34,6 +35,7 @@ class Calibrate(Command):
         if word in ("-h", "--help"):
             return cls, name, ["--help"]
         commands = {"apply": Apply, "show": Show, "compare": CompareCalibrations}
+        commands |= {"board": PrintBoard, "undistort": Undistort}
         if word in commands:
             return commands[word], f"{name} {word}", arguments[1:]
         if word not in KINDS:
@@ -48,7 +50,9 @@ def _help() -> str:
     lines += [
         f"{'apply':<14}correct the inertial data of a session by a calibration, or keep the calibration with it",
         f"{'show':<14}show a calibration.toml",
-        f"{'compare':<14}differences of two calibrations, over their sigmas",
+        f"{'compare':<14}differences of two calibrations, over their sigmas, of cameras also in pixels",
+        f"{'board':<14}write a calibration board as a PDF",
+        f"{'undistort':<14}write the pictures of a folder without distortion",
     ]
     return "\n\nKinds:\n\n" + "\n\n".join(lines)
 
@@ -144,6 +148,7 @@ class CompareCalibrations(Reporting):
             for name, (change, sigmas) in values.items():
                 beside = "" if math.isnan(sigmas) else f"  ({sigmas:+.1f} sigma)"
                 lines.append(f"  {name:<34}{change:+.6g} {one.pieces[kind].values[name].unit}{beside}")
+        lines += camera_differences(one, two)
         self.report(found, "\n".join(lines))
 
 

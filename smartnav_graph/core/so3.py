@@ -82,6 +82,11 @@ def right_jacobian(theta: Floats) -> Floats:
     return np.asarray(np.eye(3) - one[:, None, None] * cross + two[:, None, None] * cross @ cross)
 
 
+def is_rotation(R: Floats, atol: float = 1e-6) -> bool:
+    """Whether R (3, 3) is a rotation matrix."""
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=atol) and np.linalg.det(R) > 0)
+
+
 def best_rotation(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """The rotation R (3, 3) that minimises sum |y - R x|^2 over points x, y (n, 3), each minus its mean.
 

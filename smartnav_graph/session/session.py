@@ -202,8 +202,14 @@ class Session(Streams):
         return float(np.degrees(np.arctan2(*self.magnetic_field_ut[:2])))
 
     def mount(self, sensor: str) -> Mount:
-        """Where `sensor` is mounted; the body origin where the session does not give it."""
-        return self.sensors.get(sensor, Mount())
+        """Where `sensor` is mounted; the body origin where the session does not give it. Axes of a camera that were
+        calibrated take precedence."""
+        found = self.sensors.get(sensor, Mount())
+        camera = None if self.calibration is None else self.calibration.cameras.get(sensor)
+        if camera is None or not camera.body_R:
+            return found
+        a, b, c, d, e, f, g, h, i = camera.body_R
+        return dataclasses.replace(found, body_R=((a, b, c), (d, e, f), (g, h, i)))
 
     def lever_arms(self, stream: Positioned) -> Floats:
         """Lever arm (n, 3) m in body axes of every row: of the sensor that a surveyed point names, else of the stream.

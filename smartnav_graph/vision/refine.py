@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.core.so3 import exp, log
+from smartnav_graph.core.so3 import exp, is_rotation, log
 from smartnav_graph.vision.epipolar import cross, rays, sampson
 
 State = tuple[Floats, ...]
@@ -46,7 +46,7 @@ class RotationPrior:
 
     def __post_init__(self) -> None:
         R = np.asarray(self.c0_R_c1, dtype=np.float64)
-        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+        if R.shape != (3, 3) or not is_rotation(R):
             raise ConfigError("rotation prior", "c0_R_c1 is no rotation", "a (3, 3) rotation matrix")
         if not 0 < self.sigma < np.inf:
             raise ConfigError("rotation prior", f"sigma = {self.sigma} rad", "> 0 and finite", "leave the prior out")

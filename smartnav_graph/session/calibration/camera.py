@@ -16,6 +16,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.core.so3 import is_rotation
 
 LARGEST_PX = 100_000
 # Numbers of distortion coefficients a model may have.
@@ -30,7 +31,8 @@ class Camera:
     width, height : px, of the images; fx, fy, cx, cy : px
     noise_px : sigma of an inlier match, px per axis; time_offset_s : a frame stamped t shows IMU time t + offset;
     readout_s : from the first row to the last, 0 for a global shutter
-    boresight_sigma_deg, time_offset_sigma_s : sigmas of its attitude in the body (in the session) and of its clock
+    boresight_sigma_deg, time_offset_sigma_s : sigmas of its attitude in the body and of its clock
+    body_R : row-major (3, 3), its axes in the body where they were calibrated; else the session's mount has them
     """
 
     width: int
@@ -46,6 +48,7 @@ class Camera:
     readout_s: float = 0.0
     boresight_sigma_deg: float = 0.5
     time_offset_sigma_s: float = 0.02
+    body_R: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, self.time_offset_s, self.readout_s)
@@ -64,6 +67,8 @@ class Camera:
         for name in ("readout_s", "boresight_sigma_deg", "time_offset_sigma_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise self._error(f"{name} = {getattr(self, name)}", "a finite number >= 0")
+        if self.body_R and not (len(self.body_R) == 9 and is_rotation(np.reshape(self.body_R, (3, 3)))):
+            raise self._error(f"body_R = {list(self.body_R)}", "nine numbers of a rotation matrix, row by row")
 
     def _error(self, found: str, expected: str, remedy: str = "see calibration/camera.py") -> CalibrationError:
         return CalibrationError("calibration.toml [cameras]", found, expected, remedy)
