@@ -27,8 +27,8 @@ from smartnav_graph.smoothers.sensitivity import LinearPart, LinearSystem, Sensi
 
 # Errors that are looked for: amplitude in units of the stated sigmas, and correlation time, s.
 LASTING = ((1.0, 10.0), (2.0, 20.0))
-# Logarithm of the Bayes factor from which they are there.
-EVIDENCE = 1.0
+# Logarithm of the Bayes factor from which they are more likely than not.
+EVIDENCE = 0.0
 # Fixes needed, those looked at, and the least sigma (m): below it clocks and lever arms are no better.
 LEAST_FIXES, MOST_FIXES, LEAST_SIGMA = 30, 120, 0.1
 
@@ -57,7 +57,7 @@ def _evidence(
     poses = [(part, part.pose()) for part in parts if part.name.sensor == builder.name]
     rows = [(part, *pose) for part, pose in poses if pose is not None][:MOST_FIXES]
     if len(rows) < LEAST_FIXES:
-        return 0.0
+        return -np.inf
     place, R = {index: k for k, index in enumerate(estimate.indices)}, estimate.states()[0]
     sigma = builder.scaled_sigma(pass_state)[[part.name.row for part, _, _ in rows]]
     axes = 3 if builder.measures_height.all() else 2
