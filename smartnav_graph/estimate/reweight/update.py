@@ -62,6 +62,9 @@ SURPRISE = 0.01
 # have few degrees of freedom and change slowly.
 STEADY = 0.1
 STEADY_INERTIAL = 0.1
+# What needs the trajectory found joins once the sigma of fixes changes by less than this: residuals hold what it will
+# explain, so that the rest of the noise is found beside it.
+CLOSE = 0.4
 
 
 # Growth of mu a pass, and the most passes that takes.
@@ -123,13 +126,14 @@ def _update_noise_and_fixes(
     if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
     names = [name for builder, _ in found.values() for name in (*builder.noise_names, builder.stated_name)]
-    steady = all(abs(np.log(new.scale(name) / pass_state.scale(name))) < STEADY for name in names)
+    change = max((abs(np.log(new.scale(name) / pass_state.scale(name))) for name in names), default=0.0)
     new, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
-    steady = steady and calm
-    if not (steady and new.rejected == pass_state.rejected):
+    if new.rejected != pass_state.rejected:
         return new, False
     grown = enable_second_stage(builders, estimate, new)
-    return grown, grown == new
+    if grown.stage > new.stage and change < CLOSE:
+        return grown, False
+    return (grown, grown == new) if calm and change < STEADY else (new, False)
 
 
 def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[int]:
@@ -159,7 +163,7 @@ def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals
     """The next least sigma (m) of fixes under the loss: a share of this one, less where most fixes agree better, none
     once it would be below what is known of them."""
     known = [(float(np.median(one.sigma[:, :2])), float(np.median(one.square))) for _, one in found.values()]
-    level = chi2(3).median()
+    level = chi2.median(3)
     wanted = min(NARROWER * control, 2.0 * max(sigma * np.sqrt(max(square / level, 1.0)) for sigma, square in known))
     return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
 
