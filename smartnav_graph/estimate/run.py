@@ -32,7 +32,9 @@ from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
 from smartnav_graph.estimate.result.score_tests import unmodelled
 from smartnav_graph.estimate.result.summary import summarise
 from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.factors.smart import SmartBuilder
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.graph.windows import Window
@@ -71,13 +73,21 @@ def initialise(problem: Problem, longest_s: float | None = None) -> InitialState
     if problem.positions_only:
         return first_position(problem)
 
+    blind = _without_images(problem)
+
     def solve(
         prior: PriorBuilder, count: int, pass_state: PassState, initial_values: gtsam.Values | None
     ) -> tuple[Estimate, PassState]:
-        windows = problem.windows[:count]
-        return solve_passes(problem, windows, prior, pass_state, initial_values=initial_values, coarse_start=True)[:2]
+        windows = blind.windows[:count]
+        return solve_passes(blind, windows, prior, pass_state, initial_values=initial_values, coarse_start=True)[:2]
 
-    return _with_second_stage(problem, find_initial_state(first_stretch(problem, longest_s), solve))
+    return _with_second_stage(blind, find_initial_state(first_stretch(problem, longest_s), solve))
+
+
+def _without_images(problem: Problem) -> Problem:
+    """The problem without image pairs and tracks: they are tested against a trajectory, which the start is not yet."""
+    kept = [one for one in problem.builders if not isinstance(one, CoplanarityBuilder | SmartBuilder)]
+    return replace(problem, builders=kept)
 
 
 def _with_second_stage(problem: Problem, initial: InitialState) -> InitialState:
