@@ -19,7 +19,7 @@ from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, d
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
 from smartnav_graph.smoothers.covariance import marginals
 from smartnav_graph.smoothers.minimise import Solve
-from smartnav_graph.smoothers.whole_graph import StackedFactors, WholeGraph, stacks_of
+from smartnav_graph.smoothers.whole_graph import Snapshot, StackedFactors, WholeGraph, stacks_of
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,11 @@ class Estimate:
     def all_stacks(self) -> Sequence[StackedFactors]:
         """The blocks of all sensors, joined, in the order of the graph."""
         return stacks_of(self.blocks, self.held)
+
+    @cached_property
+    def snapshot(self) -> Snapshot:
+        """The solution as arrays, for what the stacks are linearised to there."""
+        return Snapshot(self.values, self.held)
 
     @cached_property
     def _states(self) -> tuple[Floats, Floats, Floats, Floats]:

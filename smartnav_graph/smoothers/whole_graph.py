@@ -99,22 +99,25 @@ class StackedFactors:
 
         values : gtsam.Values, or a `Snapshot` that stacks share
         """
-        return (values if isinstance(values, Snapshot) else Snapshot(values, self.held)).linearized(self)
+        return self._snapshot(values).linearized(self)
+
+    def _snapshot(self, values: gtsam.Values | Snapshot) -> Snapshot:
+        return values if isinstance(values, Snapshot) else Snapshot(values, self.held)
 
     def states(self, snapshot: Snapshot) -> list[Floats]:
         """The states (m, ...) of the rows, one array a letter of the model."""
         columns = zip(self.model.letters, self._names.T, strict=True)
         return [snapshot.column(letter, names) for letter, names in columns]
 
-    def measured(self, values: gtsam.Values) -> Measured:
+    def measured(self, values: gtsam.Values | Snapshot) -> Measured:
         """Every measurement by itself: the rows, or the measurements they combine."""
         if hasattr(self.model, "measured"):
-            found: Measured = self.model.measured(self.states(Snapshot(values, self.held)), self.data)
+            found: Measured = self.model.measured(self.states(self._snapshot(values)), self.data)
             return found._replace(used=found.used & self.used[found.row])
         white, _ = self.linearize(values)
         return Measured(np.arange(len(white)), white, self.weight(white), self.used)
 
-    def sizes(self, values: gtsam.Values) -> Floats:
+    def sizes(self, values: gtsam.Values | Snapshot) -> Floats:
         """Norm (m,) of each whitened row; of one that combines many measurements, their median."""
         found = self.measured(values)
         norm = np.linalg.norm(found.white, axis=1)

@@ -157,7 +157,7 @@ def residuals(solved: SolvedProblem) -> Residuals:
 
 
 def _of_stack(stack: StackedFactors, estimate: Estimate) -> Part:
-    found = stack.measured(estimate.values)
+    found = stack.measured(estimate.snapshot)
     weight = np.where(found.used, found.weight, 0.0)
     return stack.t_ns[found.row], stack.sensor, found.white, weight, found.used
 

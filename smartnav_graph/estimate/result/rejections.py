@@ -47,7 +47,7 @@ def _rows(problem: Problem, estimate: Estimate) -> list[Rejection]:
     found: list[Rejection] = []
     for sensor in sorted({block.sensor for block in estimate.blocks}):
         for stack in estimate.stacks(sensor):
-            size = stack.sizes(estimate.values)
+            size = stack.sizes(estimate.snapshot)
             left_out = ~stack.used
             if stack.loss == "cauchy":
                 left_out |= stack.weight(size[:, None]) < LEFT_OUT

@@ -55,7 +55,7 @@ def _unexplained(stack: StackedFactors, jacobians: list[Floats], estimate: Estim
 def _scales(
     stack: StackedFactors, groups: Iterable[str], estimate: Estimate, pass_state: PassState
 ) -> dict[str, float]:
-    white, jacobians = stack.linearize(estimate.values)
+    white, jacobians = stack.linearize(estimate.snapshot)
     weight = stack.weight(white) * stack.used
     left = _unexplained(stack, jacobians, estimate)
     found = {}

@@ -140,7 +140,7 @@ def _native(windows: Sequence[Window], estimate: Estimate) -> _Linear:
 
 def _scaled(stack: StackedFactors, windows: Sequence[Window], estimate: Estimate) -> _Linear:
     """Of windows whose scale factors are states; that these move the residuals too is left out, they are few."""
-    residual, (pose, velocity, pose_j, velocity_j, bias, _) = stack.linearize(estimate.values)
+    residual, (pose, velocity, pose_j, velocity_j, bias, _) = stack.linearize(estimate.snapshot)
     place = {block.t_ns: row for row, block in enumerate(stack.blocks)}
     rows = [place[w.t1_ns] for w in windows]
     before, after = np.concatenate([pose, velocity, bias], axis=2), np.concatenate([pose_j, velocity_j], axis=2)

@@ -107,7 +107,7 @@ class Verdict:
 
     def relative(self, probability: float | None = None) -> Floats:
         """Squares (m,) in units of the gate's."""
-        level = float(np.median(self.square)) / float(chi2(self.dim).median())
+        level = float(np.median(self.square)) / float(chi2.median(self.dim))
         return np.asarray(self.square / self.limit(level, probability))
 
 
@@ -139,12 +139,12 @@ def _block_verdict(builder: Builder, estimate: Estimate) -> list[Verdict]:
     stacks = estimate.stacks(builder.name)
     if not stacks:
         return []
-    white = [stack.linearize(estimate.values)[0] for stack in stacks]
+    white = [stack.linearize(estimate.snapshot)[0] for stack in stacks]
     square = np.concatenate([(rows**2).sum(axis=1) for rows in white])
     dim = white[0].shape[1]
 
     def limit(level: float, probability: float | None) -> Floats:
-        return np.full(len(square), chi2(dim).ppf(probability or builder.gate_probability) * max(1.0, level))
+        return np.full(len(square), chi2.ppf(probability or builder.gate_probability, dim) * max(1.0, level))
 
     rows = np.concatenate([stack.rows for stack in stacks])
     return [Verdict(builder.name, rows, square, dim, limit)]
