@@ -23,7 +23,7 @@ from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.smoothers.estimate import Estimate
 
 # The square that a good keyframe exceeds once in a million times, sigma a few times too small; the share of them.
-LIMIT = 9.0 * float(chi2(3).isf(1e-6))
+LIMIT = 9.0 * float(chi2.isf(1e-6, 3))
 MOST = 0.5
 
 

@@ -8,14 +8,14 @@ accelerometer negated as a whole and fixes mirrored, only the up axis decides: b
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.detect.clock import LEAST_FIXES, FixTrack, course_score, shape_score, still_score
-from smartnav_graph.session.detect.motion import levelled_motion
+from smartnav_graph.session.detect.motion import InertialMotion, covered, motion_of, step_means
 from smartnav_graph.session.streams import Imu
 
 _MOST_FIXES, _AROUND_S = 150, 70.0  # fixes in a row that are used, and inertial data around them
@@ -73,14 +73,16 @@ def find_axes_fault(imu: Imu, fixes: FixTrack, start_ns: int, lag_s: float = 0.0
         return None
     begin, end = (start_ns + round((t - lag_s) * NS) for t in (fixes.t[0] - _AROUND_S, fixes.t[-1] + _AROUND_S))
     imu = imu.take((imu.t_ns >= begin) & (imu.t_ns <= end))
-    if len(imu) < 2:
+    if len(imu) < 2 or not covered(imu):
         return None
-    shifted = FixTrack(fixes.t - (int(imu.t_ns[0]) - start_ns) / NS, fixes.position)
+    means, inertial_ns = step_means(imu), int(imu.t_ns[0])
+    shifted = FixTrack(fixes.t - (inertial_ns - start_ns) / NS, fixes.position)
     near = lag_s + np.arange(-_NEAR_S, _NEAR_S + 1e-9, 0.25)
     away = np.arange(2.0 * _NEAR_S, _FAR_S, 1.0)
     lags = np.concatenate([near, lag_s - away, lag_s + away])
     same = Axes("", "", np.eye(3), np.eye(3))
-    scores = [score for axes in (same, *AXES) if (score := _score(imu, shifted, axes, lags)) is not None]
+    tried = (_score(motion_of(inertial_ns, *_changed(means, axes)), shifted, axes, lags) for axes in (same, *AXES))
+    scores = [score for score in tried if score is not None]
     if len(scores) <= len(AXES):
         return None
     course, shape = np.array(scores).transpose(1, 0, 2)
@@ -95,11 +97,13 @@ def find_axes_fault(imu: Imu, fixes: FixTrack, start_ns: int, lag_s: float = 0.0
     return AxesFault(gain, tuple(alike))
 
 
-def _score(imu: Imu, fixes: FixTrack, axes: Axes, lags: Floats) -> tuple[Floats, Floats] | None:
+def _changed(means: tuple[Floats, Floats], axes: Axes) -> tuple[Floats, Floats]:
+    """Means (n, 3) of gyro and accel with their axes changed."""
+    return means[0] @ axes.gyro, means[1] @ axes.accel
+
+
+def _score(motion: InertialMotion, fixes: FixTrack, axes: Axes, lags: Floats) -> tuple[Floats, Floats] | None:
     """Log likelihoods (k,) of lags (k,) s by course and shape."""
-    motion = levelled_motion(replace(imu, gyro=imu.gyro @ axes.gyro, accel=imu.accel @ axes.accel))
-    if motion is None:
-        return None
     track = FixTrack(fixes.t, np.conj(fixes.position)) if axes.mirrored else fixes
     shape = shape_score(motion, track, lags)
     return None if shape is None else (course_score(motion, track, lags), shape)

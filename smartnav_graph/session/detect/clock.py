@@ -126,17 +126,22 @@ class FixTrack:
         return FixTrack(self.t[first : first + count], self.position[first : first + count])
 
 
-def _at(values: Complexes, step: Floats) -> Complexes:
-    """Linear interpolation at fractional indices; NaN outside."""
-    index = np.clip(step.astype(np.intp), 0, len(values) - 2)
-    found = np.take(values, index) + (step - index) * np.take(np.diff(values), index)
-    found[(step < 0.0) | (step > len(values) - 1)] = np.nan
-    return np.asarray(found)
+class _Curve:
+    """Linear interpolation of values (n,) at fractional indices; NaN outside."""
+
+    def __init__(self, values: Complexes) -> None:
+        self.values, self.slope = values, np.diff(values)
+
+    def at(self, step: Floats) -> Complexes:
+        index = np.clip(step.astype(np.intp), 0, len(self.slope) - 1)
+        found = np.take(self.values, index) + (step - index) * np.take(self.slope, index)
+        found[(step < 0.0) | (step > len(self.slope))] = np.nan
+        return np.asarray(found)
 
 
 def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Floats:
     """Log likelihood (k,) of lags (k,) s by the course: of chords between fixes, and of longer ones of less noise."""
-    axis: Complexes = np.concatenate([[0j], np.cumsum(np.exp(2j * motion.heading)) * STEP_S])
+    axis = _Curve(np.concatenate([[0j], np.cumsum(np.exp(2j * motion.heading)) * STEP_S]))
     score = np.zeros(len(lags))
     for begin, end, d in (fixes.chords(1), fixes.chords(max(1, round(_LONG_CHORD_S / fixes.spacing_s)))):
         square, middle = d**2, 0.5 * (begin + end)
@@ -144,7 +149,7 @@ def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Float
         edges, place = np.unique(np.concatenate([begin, end]), return_inverse=True)
         first, last = np.split(place, 2)
         for part in np.array_split(np.arange(len(lags)), -(-len(lags) // 500)):
-            reached = _at(axis, (edges - lags[part, None]) / STEP_S)
+            reached = axis.at((edges - lags[part, None]) / STEP_S)
             along = np.conj(reached[:, last] - reached[:, first]) * (square / (end - begin))
             along[np.isnan(along)] = 0.0
             for rows in blocks:
@@ -159,19 +164,22 @@ def course_score(motion: InertialMotion, fixes: FixTrack, lags: Floats) -> Float
 
 def shape_scores(motion: InertialMotion, fixes: FixTrack, lags: Floats, length_s: float, degree: int) -> Floats:
     """Log likelihood (w, k) of lags (k,) s by the shape of the way in every window of `FixTrack.windows`."""
-    found = []
+    found, displacement = [], _Curve(motion.displacement)
     for window in fixes.windows(length_s, degree):
         t, n = fixes.t[window], window.stop - window.start
         basis = np.linalg.qr(np.vander(2.0 * (t - t[0]) / (t[-1] - t[0]) - 1.0, degree + 1))[0]
         p = fixes.position[window] - fixes.position[window][0]
         p = p - basis @ (basis.T @ p)
         power = float((np.abs(p) ** 2).sum())
+        onto = np.column_stack([basis, np.conj(p)])  # p has nothing along the basis
         J = np.empty(len(lags))
         for part in np.array_split(np.arange(len(lags)), -(-len(lags) // 5000)):
-            q = _at(motion.displacement, (t - lags[part, None]) / STEP_S - 0.5)
-            q = q - q.mean(axis=1, keepdims=True)
-            q = q - (q @ basis) @ basis.T
-            J[part] = power + (np.abs(q) ** 2).sum(axis=1) - 2.0 * np.abs(q @ np.conj(p))
+            q = displacement.at((t - lags[part, None]) / STEP_S - 0.5)
+            q -= q[:, :1].copy()
+            along = q @ onto
+            square = np.einsum("kn,kn->k", q.real, q.real) + np.einsum("kn,kn->k", q.imag, q.imag)
+            removed = (np.abs(along[:, :-1]) ** 2).sum(axis=1)
+            J[part] = power + np.maximum(square - removed, 0.0) - 2.0 * np.abs(along[:, -1])
         # outside the inertial data nothing moves
         found.append(-0.25 * n * np.log(np.where(np.isfinite(J), J, power) / n + _FLOOR**2))
     return np.array(found).reshape(-1, len(lags))

@@ -91,10 +91,13 @@ def height_steps(t_ns: Times, position: Floats, motion: InertialMotion, least: f
         for row in _candidates(jump, noise):
             if any(abs(row - other) < LEAST_FIXES for other in found) or not level[max(row - 2, 2) : row + 2].any():
                 continue
+            near = _near_step(left, row)
+            if abs(near) < (1.0 - SHARE) * least - NEAR_SIGMAS * noise:
+                continue  # no step of `least` passes the test below
             s, spread, gain = _step(t, left, row)
             if abs(jump[row - 1] - s) > SIGNIFICANT * noise + SHARE * abs(s):
                 continue  # the inertial height bends there: between two fixes there is no such step
-            if abs(_near_step(left, row) - s) > NEAR_SIGMAS * noise + SHARE * abs(s):
+            if abs(near - s) > NEAR_SIGMAS * noise + SHARE * abs(s):
                 continue  # nor between three before and three after
             if _near_step(raw, row) * np.sign(s) < 0.5 * abs(s):
                 continue  # the inertial height steps, not the fixes
@@ -195,7 +198,7 @@ def _least_absolute(A: Floats, y: Floats) -> tuple[Floats, Floats]:
     """The x of least sum |y - A x|, and these residuals, `LEAST_SIGMA` at least."""
     off = np.ones(len(y))
     for _ in range(ITERATIONS):
-        root = 1.0 / np.sqrt(off)
-        x = np.linalg.lstsq(A * root[:, None], y * root, rcond=None)[0]
+        weighted = A.T / off
+        x = np.linalg.solve(weighted @ A, weighted @ y)
         off = np.maximum(np.abs(y - A @ x), LEAST_SIGMA)
     return np.asarray(x), np.asarray(off)

@@ -51,10 +51,17 @@ class InertialMotion:
 
 def levelled_motion(imu: Imu) -> InertialMotion | None:
     """Motion by the inertial data; None for less than 10 s or more than a day."""
-    if not _LENGTH_S[0] < (int(imu.t_ns[-1]) - int(imu.t_ns[0])) / NS < _LENGTH_S[1]:
-        return None
-    gyro, accel = step_means(imu)
-    gyro -= _constant_bias(gyro, accel)
+    return motion_of(int(imu.t_ns[0]), *step_means(imu)) if covered(imu) else None
+
+
+def covered(imu: Imu) -> bool:
+    """Whether the inertial data last more than 10 s and less than a day."""
+    return bool(_LENGTH_S[0] < (int(imu.t_ns[-1]) - int(imu.t_ns[0])) / NS < _LENGTH_S[1])
+
+
+def motion_of(start_ns: int, gyro: Floats, accel: Floats) -> InertialMotion:
+    """Motion by the means of gyro and accel (n, 3) over steps, see `step_means`."""
+    gyro = gyro - _constant_bias(gyro, accel)
     R = _attitude(gyro)
     force = R.apply(accel)
     up = _vertical(force, _LEVEL_S)
@@ -64,7 +71,7 @@ def levelled_motion(imu: Imu) -> InertialMotion | None:
     rate = np.einsum("ij,ij->i", R.apply(gyro), up)
     velocity = _integral(acceleration - acceleration.mean())
     climb = _integral(level[:, 2] - level[:, 2].mean())
-    return InertialMotion(int(imu.t_ns[0]), _integral(rate), _integral(velocity), _integral(climb))
+    return InertialMotion(start_ns, _integral(rate), _integral(velocity), _integral(climb))
 
 
 def _integral(values: NDArray[_Number]) -> NDArray[_Number]:

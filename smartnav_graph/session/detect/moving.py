@@ -181,7 +181,7 @@ class _Positions:
         weight = t - t.mean()
         weight /= weight @ weight
         drift = correlated**2 * np.exp(-np.abs(t[:, None] - t) / self.correlated_s)
-        rare = student_t(len(t) - 2).isf(norm.sf(SIGNIFICANT))
+        rare = student_t.isf(norm.sf(SIGNIFICANT), len(t) - 2)
         square = (rare * white) ** 2 * (weight @ weight) + SIGNIFICANT**2 * (weight @ drift @ weight)
         if speed < LEAST_SPEED or speed**2 < THEIL_SEN * square:
             return 0.0

@@ -99,7 +99,7 @@ def _scatter(t_ns: Times, position: Floats, units: Floats) -> Scatter:
 
 def _without_outliers(t_ns: Times, position: Floats, units: Floats) -> Indices:
     """Rows without those that disagree with their neighbours most, one among neighbours at a time; at least half."""
-    kept, limit = np.arange(len(t_ns)), float(chi2(position.shape[1]).ppf(SUSPECT))
+    kept, limit = np.arange(len(t_ns)), float(chi2.ppf(SUSPECT, position.shape[1]))
     while True:
         residual = normalised_residuals(t_ns[kept], position[kept]) / units[kept]
         square = np.pad(np.nan_to_num((residual**2).sum(axis=1)), 2)
@@ -117,7 +117,7 @@ def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
     first = np.flatnonzero(np.concatenate([[True], np.diff(t_ns) > 0])[: len(t_ns)])
     if len(first) >= LEAST_FIXES:
         residual = normalised_residuals(t_ns[first], position[first])
-        limit = chi2(position.shape[1]).ppf(AGREES) * max(_sigma(residual), 1e-9) ** 2
+        limit = chi2.ppf(AGREES, position.shape[1]) * max(_sigma(residual), 1e-9) ** 2
         out[first] = np.nan_to_num((residual**2).sum(axis=1), nan=np.inf) < limit
     return out
 
@@ -125,7 +125,7 @@ def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
 def _sigma(residual: Floats) -> float:
     square = (residual**2).sum(axis=1)
     dim = residual.shape[1]
-    return float(np.sqrt(np.quantile(square[np.isfinite(square)], QUANTILE) / chi2(dim).ppf(QUANTILE)))
+    return float(np.sqrt(np.quantile(square[np.isfinite(square)], QUANTILE) / chi2.ppf(QUANTILE, dim)))
 
 
 def sampling_noise(imu: Imu) -> tuple[float, float]:

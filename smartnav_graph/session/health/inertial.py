@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -26,6 +26,8 @@ from smartnav_graph.session.health.facts import (
 from smartnav_graph.session.streams import Imu
 
 _DEG = np.pi / 180
+_UNITS = (1.0, _DEG, 1.0 / _DEG, -1.0)  # of gyro as recorded
+_TILTED = 5.0  # deg that gravity may end off within 2 s
 _MAX_RATE = 35.0  # rad/s = 2000 deg/s, where consumer gyroscopes saturate
 _MAX_RMS_RATE = 10.0  # rad/s; a phone shaken by hand reaches 5
 _SPIKES = {"accel": 80.0, "gyro": 20.0}  # m/s^2, rad/s
@@ -92,25 +94,29 @@ def _gyro_unit(facts: Facts) -> Iterator[Finding]:
         return
     rate = np.linalg.norm(facts.imu.gyro, axis=1)
     high, rms = float(np.quantile(rate, 0.999)), float(np.sqrt((rate**2).mean()))
-    errors = tilt_errors(facts.imu)
+    errors = tilt_errors(facts.imu, (1.0,))
+    if errors is not None and errors[1.0] > _TILTED:
+        errors = tilt_errors(facts.imu)
     if high > _MAX_RATE:
         text = f"99.9 % quantile of |gyro| is {high:.3g} rad/s, beyond 2000 deg/s: it looks like deg/s"
         yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
     elif rms > _MAX_RMS_RATE:
         text = f"RMS |gyro| is {rms:.3g} rad/s: it looks like deg/s"
         yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
-    elif errors is not None and errors[1.0] > 20.0 and errors[np.pi / 180] < errors[1.0] / 4:
+    elif errors is not None and errors[1.0] > 20.0 and errors[_DEG] < errors[1.0] / 4:
         text = f"integrated gyro turns gravity {errors[1.0]:.0f} deg away from accel within 2 s: it looks like deg/s"
         yield in_another_unit("imu", text, "multiply gyro by pi/180", "gyro", _DEG)
-    elif errors is not None and errors[1.0] > 5.0 and errors[-1.0] < errors[1.0] / 4:
+    elif errors is not None and errors[1.0] > _TILTED and errors[-1.0] < errors[1.0] / 4:
         text = "gyro turns against the tilt that accel shows: its sign is wrong"
         yield Finding("imu", text, "flip the sign of gyro", verdict="contradictory")
-    elif errors is not None and errors[1.0] > 5.0 and errors[180 / np.pi] < errors[1.0] / 4:
+    elif errors is not None and errors[1.0] > _TILTED and errors[1.0 / _DEG] < errors[1.0] / 4:
         text = "accel tilts 57.3 times faster than gyro turns: gyro looks converted from deg to rad twice"
         yield in_another_unit("imu", text, "multiply gyro by 180/pi", "gyro", 1.0 / _DEG)
 
 
-def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[float, float] | None:
+def tilt_errors(
+    imu: Imu, scales: Sequence[float] = _UNITS, *, window_s: float = 2.0, windows: int = 300
+) -> dict[float, float] | None:
     """How far gravity turned by the gyro ends from the accelerometer's, for three units and the opposite sign.
 
     For windows at whose ends |accel| is near its median, the up direction a_0 (body axes) is carried through the
@@ -137,7 +143,7 @@ def tilt_errors(imu: Imu, *, window_s: float = 2.0, windows: int = 300) -> dict[
         return None
     start = start[np.linspace(0, len(start) - 1, min(windows, len(start))).astype(int)]
     up_0, up_1 = (accel[rows] / norm[rows, None] for rows in (start, start + n))
-    return {s: _median_angle_deg(imu, start, n, s, up_0, up_1) for s in (1.0, np.pi / 180, 180 / np.pi, -1.0)}
+    return {s: _median_angle_deg(imu, start, n, s, up_0, up_1) for s in scales}
 
 
 def _median_angle_deg(imu: Imu, start: Indices, n: int, s: float, up_0: Floats, up_1: Floats) -> float:
