@@ -195,11 +195,18 @@ def solve_passes(
     robust = pass_state.phase is Phase.ROBUST and not coarse_start
     error_m = PREDICTION_ERROR_M if robust else 0.0
     pass_ = Pass(pass_state, limit, 1, initial_values, initial_values, coarse_start, error_m)
-    builders, precision = [prior, *problem.builders], FIRST if coarse_start else problem.config.solver
+    builders = [prior, *problem.builders]
     while True:
         pass_ = _ready(pass_, problem, windows, prior, progress)
+        final = not coarse_start and may_be_last(pass_, problem.builders)
         smoother = Batch(
-            problem.config.batch, precision, pass_.initial_values, problem.session.t0_ns, coarse_start, first_s
+            problem.config.batch,
+            problem.config.solver if final else FIRST,
+            pass_.initial_values,
+            problem.session.t0_ns,
+            coarse_start,
+            first_s,
+            final,
         )
         before_s = _preintegration_s(problem)
         run_pass(smoother, watched(pass_.title, windows, progress), builders, pass_.pass_state)
@@ -215,6 +222,12 @@ def solve_passes(
         if following is None:
             return estimate, pass_.pass_state, pass_.number
         pass_ = following
+
+
+def may_be_last(pass_: Pass, builders: Iterable[Builder]) -> bool:
+    """Whether the solution may be that of this pass: the second stage has begun, or there is none."""
+    first = pass_.pass_state.stage < LAST_STAGE and any(b.has_second_stage(pass_.pass_state) for b in builders)
+    return not first or pass_.number == pass_.limit
 
 
 def _ready(pass_: Pass, problem: Problem, windows: Sequence[Window], prior: PriorBuilder, progress: Progress) -> Pass:

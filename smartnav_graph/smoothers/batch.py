@@ -74,7 +74,8 @@ class Batch:
     """Collects updates; `estimate` solves them.
 
     initial_values : of an earlier pass, taken for every state they hold; coarse_start : the first state is an initial
-    guess; first_s : length of the segment that the first state was found on, solved as a whole
+    guess; first_s : length of the segment that the first state was found on, solved as a whole; final : this may be the
+    solution, otherwise a later pass goes on from it: windows are not preintegrated again where the bias has moved
     """
 
     config: BatchConfig = field(default_factory=BatchConfig)
@@ -83,6 +84,7 @@ class Batch:
     t0_ns: int = 0
     coarse_start: bool = False
     first_s: float = 0.0
+    final: bool = True
     updates: list[GraphUpdate] = field(default_factory=list)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     _settled: int = 0
@@ -261,7 +263,7 @@ class Batch:
             _keep_only(self.values, order)
         reintegrate = partial(_reintegrated, self.updates) if self.coarse_start else None
         solve = minimise(graph, self.values, order, precision, reintegrate)
-        if not self.coarse_start and self._refresh(solve.values):
+        if self.final and self._refresh(solve.values):
             graph = WholeGraph.of(self.updates)
             solve = minimise(graph, solve.values, order, precision)
         self.values = solve.values
