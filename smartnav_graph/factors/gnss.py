@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from smartnav_graph.core.arrays import Floats, Indices, Mask
+from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.so3 import rotate, skew
@@ -22,7 +22,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.gauss_markov import Ties, add_correlated_error, correlated_sigma
 from smartnav_graph.factors.observation import Observed, PartialPreintegration, at_keyframe, preintegrated, row_model
-from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, Phase
+from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassState, PerPass, Phase
 from smartnav_graph.graph.robust import PredictionLevel, check_loss, robust
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, FactorId, GraphUpdate
@@ -137,6 +137,7 @@ class PositionBuilder(Builder):
     interpolated: Floats = field(default_factory=lambda: np.zeros(1))
     stage: int = 0
     _ties: Ties = field(default_factory=PerWindow)
+    _sigmas: PerPass[Floats] = field(default_factory=PerPass, init=False)
     _level: PredictionLevel = field(default_factory=lambda: PredictionLevel(3))
 
     def __post_init__(self) -> None:
@@ -214,16 +215,15 @@ class PositionBuilder(Builder):
         return f"{self.name}_stated"
 
     def scaled_sigma(self, pass_state: PassState) -> Floats:
-        """Sigmas (n, 3) m after the noise scales of this sensor, with the error of interpolated rows."""
-        return self._scaled(np.arange(len(self.position)), pass_state)
+        """Sigmas (n, 3) m after the noise scales of this sensor, with the error of interpolated rows; those found are
+        `FIRST_SIGMA` at least until outliers have been looked for."""
+        return self._sigmas.of(pass_state, self._scaled_sigma)
 
-    def _scaled(self, rows: Indices, pass_state: PassState) -> Floats:
-        """Sigmas (m, 3) of rows: those found are `FIRST_SIGMA` at least until outliers have been looked for."""
-        own = self.own_sigma[rows, None]
+    def _scaled_sigma(self, pass_state: PassState) -> Floats:
         least = 0.0 if pass_state.stage == LAST_STAGE else FIRST_SIGMA
-        found = np.maximum(self.sigma[rows] * self._scale(pass_state), least)
-        sigma = np.where(own, self.sigma[rows] * pass_state.scale(self.stated_name), found)
-        return np.hypot(sigma, self.interpolated[rows, None])
+        found = np.maximum(self.sigma * self._scale(pass_state), least)
+        sigma = np.where(self.own_sigma[:, None], self.sigma * pass_state.scale(self.stated_name), found)
+        return np.hypot(sigma, self.interpolated[:, None])
 
     def _scale(self, pass_state: PassState) -> Floats:
         horizontal, vertical = (pass_state.scale(name) for name in self.noise_names)
@@ -322,7 +322,7 @@ class PositionBuilder(Builder):
     ) -> None:
         """One fix, at a keyframe or after it by a partial preintegration."""
         index, partial = at
-        sigma = self._scaled(np.array([row]), pass_state)[0]
+        sigma = self.scaled_sigma(pass_state)[row]
         weight = pass_state.weight(self.name, row)
         used = not pass_state.is_rejected(self.name, row) and weight > LEAST_WEIGHT
         if index == update.index:

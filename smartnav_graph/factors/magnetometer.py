@@ -30,7 +30,7 @@ from smartnav_graph.core.so3 import exp, rotate, skew
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.factors.observation import AtKeyframe, Observed
-from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
+from smartnav_graph.graph.pass_state import LAST_STAGE, PassState, PerPass
 from smartnav_graph.graph.robust import check_loss
 from smartnav_graph.graph.states import SessionState, State, key
 from smartnav_graph.graph.update import Builder, FactorBatch, GraphUpdate
@@ -108,8 +108,9 @@ class TurnedSamples(NamedTuple):
         border = np.concatenate([[0.0], np.cumsum(window.dt)])
         angle = np.concatenate([np.zeros((1, 3)), np.cumsum(window.gyro * window.dt[:, None], axis=0)])
         at = np.minimum(np.append((t_ns - window.t0_ns) / NS, border[-1]), border[-1])
-        reached = np.stack([np.interp(at, border, column) for column in angle.T], axis=-1)
-        return cls(samples, np.diff(at), np.diff(reached, axis=0))
+        interval = np.minimum(np.searchsorted(border, at, side="right"), len(window.dt)) - 1
+        reached = angle[interval] + (at - border[interval])[:, None] * window.gyro[interval]
+        return cls(samples, at[1:] - at[:-1], reached[1:] - reached[:-1])
 
     def mean(self, gyro_bias: Floats) -> tuple[Floats, Floats]:
         """Mean (3,) of the samples in the axes of the window's end, and the mean turn (3, 3) from their axes to these;
@@ -142,6 +143,7 @@ class MagnetometerBuilder(Builder):
     stage: int = LAST_STAGE
     held_in_replay: bool = False
     _samples: PerWindow[tuple[int, TurnedSamples | None]] = field(default_factory=PerWindow)
+    _iron: PerPass[tuple[SessionState, float]] = field(default_factory=PerPass, init=False)
 
     def __post_init__(self) -> None:
         self.soft_iron = np.reshape(self.noise.soft_iron, (3, 3))
@@ -167,7 +169,7 @@ class MagnetometerBuilder(Builder):
         y, turn = samples.mean(previous.bias.gyroscope())
         A = turn @ self.soft_iron
         sigma, shared = self.sigma(window.length_s, len(samples.step_s)), self.shared(window.length_s)
-        iron, iron_sigma = self.iron_at_start(pass_state)
+        iron, iron_sigma = self._iron.of(pass_state, self.iron_at_start)
         known = sigma**2 + self.field_sigma**2 + iron_sigma**2
         level = update.predicted.attitude().matrix() @ (y - A @ iron.initial)
         used = self.usable(pass_state) and not self.disturbed(level, known)

@@ -94,12 +94,8 @@ class PartialPreintegration(NamedTuple):
     def columns(self, offset: float = 0.0) -> Floats:
         """The data columns that `AtInstant` appends to an observation's own; `offset` s is the nominal time offset
         already contained in the instant."""
-        parts: tuple[float | Floats, ...] = (*self, offset)
-        columns, start = np.empty(WIDTH), 0
-        for part, width in zip(parts, _AT.values(), strict=True):
-            columns[start : start + width] = np.ravel(part)
-            start += width
-        return columns
+        deltas = self.dR.ravel(), self.dp, self.dv, self.by_bias.ravel()
+        return np.concatenate([(self.dt,), *deltas, self.bias, self.accel, self.gyro, (self.gravity, offset)])
 
 
 _AT = {"dt": 1, "dR": 9, "dp": 3, "dv": 3, "by_bias": 54, "bias": 6, "accel": 3, "gyro": 3, "gravity": 1, "offset": 1}

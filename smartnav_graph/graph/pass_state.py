@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,3 +98,19 @@ class PassState:
     def is_rejected(self, sensor: str, row: int) -> bool:
         """Whether a row of a sensor is rejected."""
         return row in self.rejected.get(sensor, frozenset())
+
+
+Value = TypeVar("Value")
+
+
+class PerPass(Generic[Value]):
+    """What a builder computed of a pass state alone, kept as long as it is asked for the same one."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[PassState, Value] | None = None
+
+    def of(self, pass_state: PassState, compute: Callable[[PassState], Value]) -> Value:
+        """The value of a pass state, computed the first time."""
+        if self._kept is None or self._kept[0] is not pass_state:
+            self._kept = pass_state, compute(pass_state)
+        return self._kept[1]

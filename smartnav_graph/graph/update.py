@@ -125,6 +125,8 @@ class GraphUpdate:
 
     def hold(self, values: Mapping[str, Floats]) -> None:
         """Make constants of the session states named in `values`."""
+        if not values:
+            return
         self.constants |= {name: state for name, state in self.session.items() if state.name in values}
         self.held = {name: np.asarray(values[state.name]) for name, state in self.constants.items()}
         self.session = {name: state for name, state in self.session.items() if name not in self.held}
