@@ -15,7 +15,7 @@ from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import FactorBatch
 from smartnav_graph.smoothers.estimate import Posterior
-from smartnav_graph.smoothers.whole_graph import stacks_of
+from smartnav_graph.smoothers.whole_graph import Snapshot, stacks_of
 
 
 def markov(n: int, rho: float, seed: int) -> np.ndarray:
@@ -72,7 +72,7 @@ def estimate(speeds: np.ndarray, variance: float = 0.0, used: bool = True):
     ]
     joint = np.tile(np.diag([0.0] * 6 + [variance] * 3 + [0.0] * 6), (n, 1, 1))
     return SimpleNamespace(
-        values=values,
+        snapshot=Snapshot(values, {}),
         t_ns=np.arange(n) * NS,
         marginals=Posterior(joint, joint[1:], {}),
         stacks=lambda name: stacks_of(blocks, {}),
