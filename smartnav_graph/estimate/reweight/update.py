@@ -108,7 +108,7 @@ def _update_noise_and_fixes(
     worst = {v.name: v.outside(1.0 - SURPRISE / len(v.rows)) for v in tested}
     if pass_state.phase is Phase.PLAIN and any(worst.values()):
         return replace(new, phase=Phase.ROBUST), False
-    if pass_state.narrowing:
+    if pass_state.narrowing and estimate.converged:  # otherwise a narrower loss has even less to go by
         return replace(new, robust_floor_m=_shrink_robust_scale(found, pass_state.robust_floor_m)), False
     outliers = {v.name: v.outside() - pass_state.trusted.get(v.name, frozenset()) for v in tested}
     trusted = {name: suspects(builder, outliers.get(name, frozenset())) for name, (builder, _) in found.items()}
@@ -122,7 +122,7 @@ def _update_noise_and_fixes(
         weighed = _next_gnc(tested, pass_state)
         if weighed is not None:
             return replace(weighed, noise_scales=new.noise_scales), False
-        return replace(new, phase=Phase.GATED, rejected=outliers, weights={}), False
+        return replace(new, phase=Phase.GATED, rejected=outliers, weights={}, robust_floor_m=0.0), False
     if pass_state.phase is Phase.GATED:
         new = replace(new, rejected=outliers)
     names = [name for builder, _ in found.values() for name in (*builder.noise_names, builder.stated_name)]
