@@ -8,6 +8,7 @@ camera (ECEF metres, quaternion w first, ECEF <- forward-right-down).
 from __future__ import annotations
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def _load(path: Path) -> Floats:
         return np.array(rows, dtype=np.float64)
     except FileNotFoundError as error:
         raise SessionError(path, "is missing", "a numpy array", "fetch the whole segment") from error
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError, RecursionError, TokenError) as error:
         raise SessionError(path, f"cannot be read ({error})", "a numpy array of numbers") from error
 
 
