@@ -35,6 +35,7 @@ LEAST_TURN = 0.3  # rad between directions of gravity, or of a known turn
 LONGEST_S = 60.0  # of a turn: the bias changes
 FAR = 0.3  # rad: misfit of gravity after turns beyond which signs are tried
 FASTEST = 35.0  # rad/s: range of the gyros of phones (2000 deg/s)
+FOLDS, GAIN = 5, 0.8  # of cross-validation; share of the misfit before, that a matrix must reach for turns left out
 LEAST_NOISE = 1e-4  # rad
 LEAST_MISFIT = 3e-3  # rad, of gravity after a turn by a calibrated sensor: the weight of known angles
 KNOWN_SHARE = 0.2  # by which an integrated turn may differ from a known one
@@ -154,8 +155,21 @@ def fit_turns(turns: list[Turn], where: str, options: GyroOptions) -> tuple[Adju
                 found = f"{axes} of the gyro read with the opposite sign"
                 raise CalibrationError(where, found, "counter-clockwise positive", "change it in the import")
     weight = LEAST_MISFIT / np.radians(options.turn_sigma_deg)
-    adjusted = adjust(lambda p: misfits(turns, p.reshape(3, 3), weight), NOMINAL, PRIOR, LEAST_NOISE)
-    return adjusted, before
+    return adjust(lambda p: misfits(turns, p.reshape(3, 3), weight), NOMINAL, PRIOR, LEAST_NOISE), before
+
+
+def left_out(turns: list[Turn], options: GyroOptions) -> float:
+    """RMS misfit of gravity, rad, after turns by the matrix of the other turns, a fifth at a time."""
+    weight, errors = LEAST_MISFIT / np.radians(options.turn_sigma_deg), []
+    for fold in range(min(FOLDS, len(turns))):
+        others = [turn for i, turn in enumerate(turns) if i % FOLDS != fold]
+
+        def misfit(p: Floats, others: list[Turn] = others) -> Floats:
+            return misfits(others, p.reshape(3, 3), weight)
+
+        matrix = adjust(misfit, NOMINAL, PRIOR, LEAST_NOISE).parameters.reshape(3, 3)
+        errors.append(misfits(turns[fold::FOLDS], matrix, 0.0)[: 2 * len(turns[fold::FOLDS])])
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
 def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
@@ -177,13 +191,19 @@ def fit_both(session: Session, options: GyroOptions) -> tuple[CalibrationResult,
     by = accelerated_by(session, rests, accel, options, found.parameters.reshape(3, 3))
     own = accel.found
     found = found.with_errors(derivatives_of(by, own.parameters, 0.1 * own.sigmas), own.covariance)
-    return result_of(accel, session.gravity, warnings), _gyro_result(found, before, turns, session, rests)
+    return result_of(accel, session.gravity, warnings), _gyro_result(
+        found, (before, left_out(turns, options)), turns, session, rests
+    )
 
 
 def _gyro_result(
-    found: Adjusted, before: float, turns: list[Turn], session: Session, rests: list[RestRows]
+    found: Adjusted, misfit: tuple[float, float], turns: list[Turn], session: Session, rests: list[RestRows]
 ) -> CalibrationResult:
-    values, refused = {}, {}
+    values, refused, (before, cross) = {}, {}, misfit
+    useful = cross < GAIN * before or any(turn.known for turn in turns)
+    if not useful:
+        why = f"turns left out show {cross:.2g} rad, {before:.2g} without; not used: record more turns, about all axes"
+        refused["gyro_matrix"] = why
     for i, (value, sigma) in enumerate(zip(found.parameters, found.sigmas, strict=True)):
         row, column = divmod(i, 3)
         name = f"gyro_scale_{'xyz'[row]}" if row == column else f"gyro_misalignment_{'xyz'[row]}{'xyz'[column]}"
@@ -201,6 +221,7 @@ def _gyro_result(
     residuals = {
         "gravity_before": Residual(before, len(turns), "rad"),
         "gravity": Residual(float(np.sqrt(np.mean(left**2))), len(turns), "rad"),
+        "gravity_left_out": Residual(cross, len(turns), "rad"),
         "rest_bias": Residual(float(np.sqrt(np.mean(spread**2))), count, "rad/s"),
     }
     rows = np.arange(len(turns), dtype=np.float64)
@@ -208,7 +229,7 @@ def _gyro_result(
     chart = Chart("Direction of gravity after a turn, by gyro and by accelerometer", "Turn", "Angle [°]", dots)
 
     def change(known: Calibration) -> Calibration:
-        matrix = tuple(map(float, found.parameters))
+        matrix = tuple(map(float, found.parameters if useful else NOMINAL))
         errors = replace(
             known.imu_errors, gyro_matrix=matrix, gyro_bias=(float(bias[0]), float(bias[1]), float(bias[2]))
         )

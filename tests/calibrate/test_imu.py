@@ -149,3 +149,11 @@ def test_known_turns_of_ferraris():
 def test_phones_held_in_hand(recording, after, left_out):
     result = accelerometer.fit([sn.load(DATASETS / "phone_mocap_tyrex" / recording)], None)
     assert result.residuals["length"].rms <= after and result.residuals["length_left_out"].rms <= left_out
+
+
+@real("phone_mocap_tyrex")
+def test_a_matrix_that_turns_left_out_do_not_confirm_is_not_used():
+    result = imu.fit([sn.load(DATASETS / "phone_mocap_tyrex" / "ios" / "calib_acc_iPhone5_d3")], OPTIONS)
+    assert "not used: record more turns" in result.refused["gyro_matrix"]
+    assert result.change(Calibration()).imu_errors.gyro_matrix == Calibration().imu_errors.gyro_matrix
+    assert "gyro_matrix" not in imu.fit([handled(1)], OPTIONS).refused
