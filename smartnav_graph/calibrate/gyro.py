@@ -158,7 +158,7 @@ def fit_turns(turns: list[Turn], where: str, options: GyroOptions) -> tuple[Adju
     return adjust(lambda p: misfits(turns, p.reshape(3, 3), weight), NOMINAL, PRIOR, LEAST_NOISE), before
 
 
-def left_out(turns: list[Turn], options: GyroOptions) -> float:
+def left_out_misfit(turns: list[Turn], options: GyroOptions) -> float:
     """RMS misfit of gravity, rad, after turns by the matrix of the other turns, a fifth at a time."""
     weight, errors = LEAST_MISFIT / np.radians(options.turn_sigma_deg), []
     for fold in range(min(FOLDS, len(turns))):
@@ -192,7 +192,7 @@ def fit_both(session: Session, options: GyroOptions) -> tuple[CalibrationResult,
     own = accel.found
     found = found.with_errors(derivatives_of(by, own.parameters, 0.1 * own.sigmas), own.covariance)
     return result_of(accel, session.gravity, warnings), _gyro_result(
-        found, (before, left_out(turns, options)), turns, session, rests
+        found, (before, left_out_misfit(turns, options)), turns, session, rests
     )
 
 
