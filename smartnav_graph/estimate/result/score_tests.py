@@ -45,15 +45,19 @@ PAIRS, FOCAL_STEP = "image_pairs", 1e-4
 # Errors of a class of devices: scale factors, of each axis by itself and of all axes of a sensor alike (voltage,
 # temperature, clock), and rate by specific force, rad/s / (m/s^2).
 SCALE_SIGMA, COMMON_SCALE_SIGMA = 0.002, 0.006
+# Velocity of a foot in its stances, m/s along each body axis: heights of walks and runs leave a level floor at 3 to 11
+# mm/s.
+STANCE_SPEED = 0.01
 G_SENSITIVITY_SIGMA = float(np.radians(0.02)) / STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
 class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
-    stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale`` and ``gyro
-    scale`` along the body axis `axis`; ``g-sensitivity`` of the gyro axis by the force along another, rad/s / (m/s^2);
-    ``focal length`` (relative); ``offset`` (m) of its positions to the east, north or up.
+    stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale``, ``gyro
+    scale`` and ``stance velocity`` of a foot (m/s) along the body axis `axis`; ``g-sensitivity`` of the gyro axis by
+    the force along another, rad/s / (m/s^2); ``focal length`` (relative); ``offset`` (m) of its positions to the east,
+    north or up.
 
     prior_sigma : of what devices of the class have, zero where it is not in the covariance; shows : whether the data
     can say of it
@@ -91,8 +95,9 @@ class Unmodelled(NamedTuple):
 def unmodelled(solved: SolvedProblem) -> Unmodelled | None:
     """Every error that is looked at; None where there is none."""
     linear = LinearSystem(solved.estimate)
-    parts = linear.parts({*solved.fixes, "imu", PAIRS})
+    parts = linear.parts({*solved.fixes, "imu", "static", PAIRS})
     found = [*_of_positions(solved, parts), *_of_inertial_data(solved, parts), *_of_images(solved, parts)]
+    found += _of_stances(solved, parts)
     if not found:
         return None
     sensitivity = linear.sensitivity([rows for _, rows in found])
@@ -141,7 +146,8 @@ def _of_positions(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterato
 
 def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
     """An error in proportion to a reading acts as a bias in proportion to its mean over a window, by the solution. That
-    of the mean specific force is a bias. Where noise is what makes these means vary, they are no measure of the motion.
+    of the mean specific force is a bias. Where noise is what makes these means vary, they are no measure of the motion;
+    of a foot, what its stances leave looks the same.
     """
     imu, estimate = one_of(solved.problem.builders, ImuBuilder), solved.estimate
     windows = {window.t1_ns: window for window in solved.problem.windows if window.kind == "normal"}
@@ -151,6 +157,7 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Ite
     if imu is None or not rows:
         return
     R, _, v, _ = estimate.states()
+    on_foot = solved.problem.rests is not None and solved.problem.rests.on_foot
     known = imu.weight != CLASS_WEIGHT or imu.config.scale_sigma > 0
     scale_sigma, sensitivity_sigma = (0.0, 0.0) if known else (SCALE_SIGMA, G_SENSITIVITY_SIGMA)
     first = np.array([k for _, _, k in rows])
@@ -168,14 +175,36 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Ite
         ("gyro scale", turned, imu.noise.gyro_noise_density * solved.pass_state.scale("gyro"), 3),
     )
     for kind, reading, density, bias in kinds:
-        varies = np.var(reading, axis=0) > EXCITED * density**2 * float(np.mean(1.0 / length_s))
+        varies = (np.var(reading, axis=0) > EXCITED * density**2 * float(np.mean(1.0 / length_s))) & (not on_foot)
         for axis in range(3):
-            error = SensorError("imu", kind, "xyz"[axis], prior_sigma=scale_sigma, shows=bool(varies[axis]))
+            error = SensorError(
+                "imu", kind, "xyz"[axis], prior_sigma=scale_sigma, shows=bool(varies[axis]) and not on_foot
+            )
             yield error, directions(bias + axis, reading[:, axis])
     for gyro in range(3):
         for axis in range(3):
             error = SensorError("imu", "g-sensitivity", "xyz"[gyro], prior_sigma=sensitivity_sigma, shows=False)
             yield error, directions(3 + gyro, force[:, axis])
+
+
+def _of_stances(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
+    """A foot in a stance is never quite at rest, and what the swing before leaves in the velocity is alike in every
+    step: a velocity in body axes that all stances have."""
+    rests, estimate = solved.problem.rests, solved.estimate
+    if rests is None or not rests.on_foot:
+        return
+    place = {key("V", index): k for k, index in enumerate(estimate.indices)}
+    R = estimate.states()[0]
+    rows = [
+        (part.row, -by @ R[place[name]])
+        for part in parts
+        if part.name.sensor == "static" and np.isnan(rests.over(rests.turn_sigma, part.name.t_ns, part.name.t_ns))
+        for name, by in part.by_state.items()
+        if name in place
+    ]
+    for axis in range(3) if rows else ():
+        error = SensorError("static", "stance velocity", "xyz"[axis], prior_sigma=STANCE_SPEED, shows=False)
+        yield error, [(row, by[:, axis]) for row, by in rows]
 
 
 def _of_images(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:

@@ -99,10 +99,6 @@ LIMITS = {
 }
 
 
-# The shocks of steps, and what they do to a gyroscope, look like scale errors of so many times these.
-ON_FOOT = 2.5
-
-
 @dataclass(frozen=True)
 class Reason:
     """Why a run is not good. start_s, end_s since time zero, None for all of it; size : of the fault, in the unit of
@@ -130,12 +126,6 @@ class VerdictInputs:
     withheld: Mapping[str, Withheld]
     together: bool
     unmodelled: Unmodelled | None = None
-
-    @property
-    def on_foot(self) -> bool:
-        """Whether the device swings with a foot."""
-        rests = self.solved.problem.rests
-        return rests is not None and rests.on_foot
 
 
 Test = Callable[[VerdictInputs], Iterator[Reason]]
@@ -251,9 +241,8 @@ def _sensor_errors(inputs: VerdictInputs) -> Iterator[Reason]:
         limit = LIMITS[error.kind]
         error = replace(error, sigma=error.sigma * float(np.sqrt(max(misfit.get(error.sensor, 1.0), 1.0))))
         along = (error.sensor, error.kind) == ("gnss", "lever arm") and error.axis == session.device.forward[1]
-        size = limit.size * (ON_FOOT if error.sensor == "imu" and inputs.on_foot else 1.0)
         linear = not error.kind.startswith("clock") or abs(error.value) < LINEAR_S
-        clear = linear and abs(error.value) > max(size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
+        clear = linear and abs(error.value) > max(limit.size, (1.5 if along else 1.0) * limit.sigmas * error.sigma)
         known = worst.get(error.sensor)
         if clear and (known is None or abs(error.value / error.sigma) > abs(known.value / known.sigma)):
             worst[error.sensor] = error

@@ -11,7 +11,7 @@ from sessions import on_control, recorded, shifted, truth, with_gnss, with_imu
 
 import smartnav_graph as sn
 from smartnav_graph.core.so3 import log
-from smartnav_graph.estimate.config import Config
+from smartnav_graph.estimate.config import Config, RunConfig
 from smartnav_graph.estimate.result import summary
 from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors, unmodelled
@@ -140,6 +140,19 @@ def test_scale_errors_of_the_class_are_in_the_covariance(by_class):
     own = run.solution.covariance[known, :3, :3]
     square, without = nees(error, own), nees(error, own - found.covariance()[known, :3, :3])
     assert np.mean(square < 7.8) > 0.9 > np.mean(without < 7.8)
+
+
+def test_stances_of_a_foot_make_the_height_uncertain_with_time():
+    """Without fixes a velocity that all stances have moves the height by it times the time: 1 cm/s of prior sigma."""
+    run = smooth(sn.simulate("static-60s", 0), replace(CONFIG, run=RunConfig(sensors=("imu", "static"))))
+    solved = SolvedProblem(run.problem, run.estimate, run.pass_state)
+    assert unmodelled(solved) is None
+    rests = replace(run.problem.rests, on_foot=True, turn_sigma=np.full(len(run.problem.rests.t_ns), np.nan))
+    found = unmodelled(replace(solved, problem=replace(run.problem, rests=rests)))
+    assert {error.axis for error in found.errors if error.kind == "stance velocity"} == set("xyz")
+    height = np.sqrt(found.covariance()[:, 5, 5])
+    seconds = (run.estimate.t_ns - run.estimate.t_ns[0]) / 1e9
+    assert height[-1] == pytest.approx(0.01 * seconds[-1], rel=0.2)
 
 
 def test_a_calibrated_device_has_none(eight):
