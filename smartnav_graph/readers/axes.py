@@ -100,9 +100,12 @@ def _speeds(at: Times, fixes: Table) -> Floats:
 def _means(t_ns: Times, values: Floats, grid: Times) -> Floats:
     """Means (m - 1, k) of the rows between successive stamps of a grid (m,); NaN where there are none."""
     edge = np.searchsorted(t_ns, grid)
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    count = np.diff(edge)[:, None]
-    return np.where(count > 0, np.diff(total[edge], axis=0) / np.maximum(count, 1), np.nan)
+    count = np.diff(edge)
+    there = count > 0
+    found = np.full((len(count), values.shape[1]), np.nan)
+    if there.any():  # rows between two stamps that have some end where the next ones begin
+        found[there] = np.add.reduceat(values[: edge[-1]], edge[:-1][there], axis=0) / count[there, None]
+    return found
 
 
 def sign_by_turn(force: Samples, gyro: Samples, fixes: LoggedFixes) -> float:
