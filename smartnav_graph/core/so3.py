@@ -30,6 +30,24 @@ def log(R: Floats) -> Floats:
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
 
 
+def chained(turns: Floats) -> Rotation:
+    """Products Exp(turns[0]) ... Exp(turns[k]), each k (n,), of rotation vectors (n, 3) rad."""
+    q = Rotation.from_rotvec(turns).as_quat().T.copy()
+    count = 1
+    while count < q.shape[1]:  # each holds the product of `count` turns
+        (a, b, c, d), (x, y, z, w) = q[:, :-count], q[:, count:]
+        q[:, count:] = np.stack(
+            [
+                d * x + a * w + b * z - c * y,
+                d * y - a * z + b * w + c * x,
+                d * z + a * y - b * x + c * w,
+                d * w - a * x - b * y - c * z,
+            ]
+        )
+        count *= 2
+    return Rotation.from_quat(q.T)
+
+
 def rotate(R: Floats, v: Floats) -> Floats:
     """R v, row by row: (m, 3, 3), (m, 3) -> (m, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", R, v))

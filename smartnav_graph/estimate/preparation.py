@@ -11,7 +11,8 @@ from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors import FACTORS
+from smartnav_graph.factors.camera import UNKNOWN_CAMERA
+from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
@@ -31,6 +32,7 @@ from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
+from smartnav_graph.vision.gyro_comparison import GyroComparison, compare_with_gyro, contradictions
 from smartnav_graph.vision.pairs import Pairs
 from smartnav_graph.vision.zero_motion import moving_spans, static_periods
 
@@ -43,6 +45,7 @@ class Notes:
     clocks : comparison of the sensors' clocks; findings : warnings of the health; withheld : rows held out, by stream
     dropped : rows that are not used, by stream and reason
     heights : levels of the heights of streams that have another datum, or more than one
+    camera_turns : the camera compared with the gyroscope
     """
 
     config: Config
@@ -56,6 +59,7 @@ class Notes:
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     pairs: Pairs | None = None
+    camera_turns: GyroComparison | None = None
     rests: Standstills | None = None
     heights: dict[str, HeightLevels] = field(default_factory=dict)
 
@@ -300,6 +304,20 @@ def pair_images(session: Session, notes: Notes) -> Session:
     return session
 
 
+def compare_camera(session: Session, notes: Notes) -> Session:
+    """The camera beside the gyroscope. In a replay by what is known at first."""
+    if notes.pairs is None:
+        return session
+    pairs, name = notes.pairs, camera_name(session, notes.calibration)
+    camera = notes.calibration.cameras.get(name, UNKNOWN_CAMERA)
+    if notes.causal:
+        pairs = pairs.until(notes.span[0] + round(INITIALISATION_S * NS))
+    notes.camera_turns = compare_with_gyro(pairs, session.require_imu(), camera, session.mount(name))
+    for finding in contradictions(notes.camera_turns, camera):
+        notes.findings, notes.warnings = [*notes.findings, finding], [*notes.warnings, str(finding)]
+    return session
+
+
 def detect_standstills(session: Session, notes: Notes) -> Session:
     """Standstills and stances by inertial data, listed spans and images."""
     vehicle = notes.config.run.vehicle or session.device.vehicle
@@ -363,6 +381,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "outside": drop_outside,
     "lead": trim_span,
     "images": pair_images,
+    "camera": compare_camera,
     "standstills": detect_standstills,
     "moving": refute_standstills,
 }
@@ -370,20 +389,3 @@ PREPARE: Mapping[str, PreparationStep] = {
 
 def _inside(gaps: Sequence[Gap], span: tuple[int, int]) -> list[Gap]:
     return [gap for gap in gaps if gap.end_ns > span[0] and gap.start_ns < span[1]]
-
-
-def unused_streams(session: Session) -> list[str]:
-    """Warnings of streams that no factor uses."""
-    used = {factor.stream for factor in FACTORS.values()} | {"reference", "images"}
-    idle = [name for name in session.streams() if name not in used]
-    warnings = [f"{name}: present, not used by the estimator" for name in idle]
-    images = session.images
-    if images is not None and session.matches is None and session.tracks is None and images.file.astype(bool).any():
-        warnings.append(f"images: {len(images)} pictures are not matched yet, and not used; run `smartnav match` first")
-    return warnings
-
-
-def dropped_text(name: str, counts: Mapping[str, int]) -> str:
-    """Warning of rows of a stream that are not used, by reason."""
-    reasons = ", ".join(f"{count} rows {reason}" for reason, count in counts.items())
-    return f"{name}: {reasons}; not used as recorded"

@@ -12,8 +12,8 @@ from smartnav_graph.core.tables import check
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.constant_velocity import PREPARE_POSITIONS
-from smartnav_graph.estimate.preparation import PREPARE, Notes, dropped_text, on_one_datum, unused_streams
-from smartnav_graph.factors import make_builders
+from smartnav_graph.estimate.preparation import PREPARE, Notes, on_one_datum
+from smartnav_graph.factors import FACTORS, make_builders
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import delayed
 from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
@@ -28,6 +28,7 @@ from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import Imu
+from smartnav_graph.vision.gyro_comparison import GyroComparison
 from smartnav_graph.vision.pairs import Pairs
 
 # Why a row is not in the solution of a replay.
@@ -54,6 +55,7 @@ class Problem:
     clocks: ClockReport = ClockReport()
     findings: Sequence[Finding] = ()
     heights: Mapping[str, HeightLevels] = field(default_factory=dict)
+    camera_turns: GyroComparison | None = None
 
     @property
     def vehicle(self) -> str:
@@ -111,6 +113,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
         heights={} if causal else notes.heights,
         session_states_fixed=config.replay.smoother == "isam2",
         polished=config.replay.polish,
+        camera_turns=notes.camera_turns,
     )
     windows, lost = session_windows(context, notes.span)
     builders = make_builders(context)
@@ -122,7 +125,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     return Problem(
         *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
         *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks, notes.findings),
-        notes.heights,
+        *(notes.heights, notes.camera_turns),
     )
 
 
@@ -152,6 +155,7 @@ def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
         *(session, problem.calibration, problem.gaps, problem.vehicle, problem.config, problem.rests),
         pairs=problem.pairs,
         heights=problem.heights,
+        camera_turns=problem.camera_turns,
     )
     windows, _ = session_windows(context, (problem.windows[0].t1_ns, problem.windows[-1].t1_ns))
     merge = round(problem.config.keyframes.merge_s * NS)
@@ -167,3 +171,20 @@ def batch_problem(problem: Problem, available_ns: int | None = None) -> Problem:
     if available_ns is not None:
         windows = delayed.drop_unknown(windows, problem.session.streams(), available_ns)
     return replace(problem, session=session, imu=context.bridged_imu, windows=windows, builders=make_builders(context))
+
+
+def unused_streams(session: Session) -> list[str]:
+    """Warnings of streams that no factor uses."""
+    used = {factor.stream for factor in FACTORS.values()} | {"reference", "images"}
+    idle = [name for name in session.streams() if name not in used]
+    warnings = [f"{name}: present, not used by the estimator" for name in idle]
+    images = session.images
+    if images is not None and session.matches is None and session.tracks is None and images.file.astype(bool).any():
+        warnings.append(f"images: {len(images)} pictures are not matched yet, and not used; run `smartnav match` first")
+    return warnings
+
+
+def dropped_text(name: str, counts: Mapping[str, int]) -> str:
+    """Warning of rows of a stream that are not used, by reason."""
+    reasons = ", ".join(f"{count} rows {reason}" for reason, count in counts.items())
+    return f"{name}: {reasons}; not used as recorded"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,8 @@ STREAM = "images"
 BORESIGHT = "camera_boresight_rad"
 # A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
 AROUND_S = 0.005
+# Least sigma (s) of a clock that the gyroscope shows.
+LEAST_CLOCK_SIGMA_S = 0.002
 # Used where no camera is calibrated: a phone's at 640 x 480.
 UNKNOWN_CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
@@ -81,6 +83,7 @@ class CameraModel:
 
     camera : its calibration, or a substitute; readout_s : from its first row to its last, zero where rows
     are taken as seen at once; boresight_sigma rad, clock_sigma s : priors of its states, zero for none
+    turned (3,) rad : the boresight that is expected
     """
 
     camera: Camera
@@ -88,15 +91,21 @@ class CameraModel:
     readout_s: float
     boresight_sigma: float
     clock_sigma: float
+    turned: Floats = field(default_factory=lambda: np.zeros(3))
 
     def states(self) -> Mapping[str, SessionState]:
         """Session states of the camera, by letter."""
         found = {}
         if self.rig.timed:
-            found["T"] = clock_state(STREAM, self.clock_sigma)
+            found["T"] = clock_state(STREAM, self.clock_sigma, self.rig.known_s)
         if self.rig.boresight:
-            found["A"] = SessionState("A", STREAM, BORESIGHT, np.zeros(3), np.full(3, self.boresight_sigma))
+            found["A"] = SessionState("A", STREAM, BORESIGHT, self.turned, np.full(3, self.boresight_sigma))
         return found
+
+    @property
+    def body_R_cam(self) -> Floats:
+        """Axes of the camera (3, 3) as they are expected."""
+        return np.asarray(self.rig.body_R_cam @ exp(self.turned))
 
     def delay(self, xy_n: Floats) -> Floats:
         """When points (m, 2) were seen, s (m,) after the first row of their image."""
@@ -109,7 +118,7 @@ class CameraModel:
         """Rotation vectors (m, 3), camera axes, of the camera from stamps (m,) to `delay` (m,) s later; `bias` (m, 3)
         of the gyroscope."""
         turn = rates.turn(t_ns, delay) - bias * delay[:, None]
-        return np.asarray(turn @ self.rig.body_R_cam)
+        return np.asarray(turn @ self.body_R_cam)
 
     def velocity(self, motion: Motion, rate: Floats) -> Floats:
         """Of the camera (k, 3) m/s in nav axes, from that of the body and its rate (k, 3) rad/s."""
@@ -133,9 +142,14 @@ def make_camera_model(
     degrees = camera.boresight_sigma_deg if boresight_sigma_deg is None else boresight_sigma_deg
     seconds = camera.time_offset_sigma_s if time_offset_sigma is None else time_offset_sigma
     body_R, body_t = np.array(mount.body_R, dtype=np.float64), np.array(mount.body_t, dtype=np.float64)
-    rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0)
+    turned, seen = np.zeros(3), context.camera_turns
+    if seen is not None and context.camera_offset_s and seconds > 0:
+        seconds = max(seen.sigma_s, LEAST_CLOCK_SIGMA_S)
+    if seen is not None and degrees > 0 and seen.turned_by > np.radians(degrees):
+        turned = seen.boresight
+    rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0, known_s=context.camera_offset_s)
     readout = _readout_s(context) if row_time else 0.0
-    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds)
+    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, turned)
 
 
 def _readout_s(context: FactorContext) -> float:

@@ -19,6 +19,7 @@ from smartnav_graph.session.detect.heights import HeightLevels
 from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Imu
+from smartnav_graph.vision.gyro_comparison import LINEAR_S, GyroComparison
 from smartnav_graph.vision.pairs import Pairs
 
 Section = TypeVar("Section")
@@ -35,6 +36,7 @@ class FactorContext:
     session_states_fixed : the smoother of a replay keeps session states at their initial values
     heights : levels of the heights of streams that have another datum, or more than one
     polished : a batch solution follows the replay
+    camera_turns : the camera compared with the gyroscope, where it was
     """
 
     session: Session
@@ -48,6 +50,7 @@ class FactorContext:
     session_states_fixed: bool = False
     polished: bool = True
     heights: Mapping[str, HeightLevels] = field(default_factory=dict)
+    camera_turns: GyroComparison | None = None
 
     def height_offsets(self, name: str, t_ns: Times) -> Floats:
         """What was taken (n,) m from the heights of a stream's rows."""
@@ -81,11 +84,18 @@ class FactorContext:
 
     @property
     def image_ns(self) -> Times:
-        """Stamps of the keyframes at the images of the pairs, by the clock offset that the calibration knows."""
+        """Stamps of the keyframes at the images of the pairs, by the clock offset that is known."""
         if self.pairs is None:
             return np.zeros(0, dtype=np.int64)
         offset = 0.0 if self.camera is None else self.camera.time_offset_s
-        return np.asarray(self.pairs.t_ns + round(offset * NS))
+        return np.asarray(self.pairs.t_ns + round((offset + self.camera_offset_s) * NS))
+
+    @property
+    def camera_offset_s(self) -> float:
+        """Offset (s) of the camera's clock beside the calibrated one, as the gyroscope shows it; zero where it is too
+        small to matter, or not known."""
+        found = self.camera_turns
+        return found.offset_s if found is not None and found.known and abs(found.offset_s) > LINEAR_S else 0.0
 
     @property
     def on_foot(self) -> bool:

@@ -33,18 +33,22 @@ from smartnav_graph.vision.pairs import Pairs
 BASELINE_FLOOR_M = 1e-3
 # Parts of the normal equations smaller than this share of the largest are rounding.
 ROUNDING = 1e-12
+# Error of the rotation that all matches of a pair share, in units of that of the direction of the baseline.
+TURN_SHARE = 0.03
 # Columns of a row's data: number of the pair, body rate (3) rad/s at both keyframes.
 COLUMNS = 7
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Camera in the body: body_R_cam (3, 3), body_t_cam (3,) m; boresight, timed : which states are estimated."""
+    """Camera in the body: body_R_cam (3, 3), body_t_cam (3,) m; boresight, timed : which states are estimated;
+    known_s : clock offset that the keyframes at the images have already."""
 
     body_R_cam: Floats
     body_t_cam: Floats
     boresight: bool = False
     timed: bool = False
+    known_s: float = 0.0
 
     @property
     def letters(self) -> tuple[str, ...]:
@@ -68,6 +72,7 @@ def relative(rig: Rig, states: Sequence[Floats], data: Floats) -> Relative:
     delay = np.zeros((len(data), 1))
     if rig.timed:
         *speeds, delay = rest[:3]
+        delay = delay - rig.known_s
         rest = rest[3:]
     rate = data[:, 1:4], data[:, 4:7]
     poses = (
@@ -211,9 +216,13 @@ class CompressedRows(Matched):
     N = sum N_i / sum s_0i^2 with s_i^2 = vec(E)^T N_i vec(E). Exact but for the change of the weights relative to each
     other. Where the matches have shifts d of their own in the baseline, the constant x0~^T [d]x R x1~ of each, R where
     it was compressed, is a tenth column beside vec(E).
+
+    shared : sigma (rad) of the direction of a baseline beside the noise of its matches
     """
 
-    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float, frozen: Relative) -> None:
+    def __init__(
+        self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float, frozen: Relative, shared: float = 0.0
+    ) -> None:
         super().__init__(pairs, rig, sigma, use, loss_scale)
         a, b = rays(self.x0), rays(self.x1)
         E = essential(frozen.R, frozen.t)
@@ -230,10 +239,17 @@ class CompressedRows(Matched):
         total = np.maximum((square * weight).sum(axis=1), 1e-300)
         self.length = _lengths(a, b, weight) / total[:, None, None]
         self.floor = BASELINE_FLOOR_M**2 * weight.sum(axis=1) / total
+        if shared > 0.0:
+            self.root = self._with_shared_error(shared, frozen)
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         rows = data[:, 0].astype(np.intp)
         there = relative(self.rig, states, data)
+        r, by = self._missed(rows, there)
+        return r, [by @ jacobian for jacobian in there.by]
+
+    def _missed(self, rows: NDArray[np.intp], there: Relative) -> tuple[Floats, Floats]:
+        """Residuals (m, 9) of some pairs, and their derivatives (m, 9, 6) by the relative pose."""
         e, by_e = _vectorised(there.R, there.t)
         N, root = self.length[rows], self.root[rows]
         Ne = rotate(N, e)
@@ -242,7 +258,20 @@ class CompressedRows(Matched):
         at_e, constant = root[:, :, :9], root[:, :, 9:].sum(axis=2)
         r = (rotate(at_e, e) + constant) / (self.sigma * s)
         by = at_e / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
-        return r, [by @ by_e @ jacobian for jacobian in there.by]
+        return r, by @ by_e
+
+    def _with_shared_error(self, sigma: float, frozen: Relative) -> Floats:
+        """The rows whitened beside an error that all matches of a pair share: of the direction of the baseline, `sigma`
+        rad, and of the rotation, a share of it. With A the derivatives by the relative pose,
+
+            Q = diag(s_R^2 1, sigma^2 (|t|^2 1 - t t^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
+        """
+        t, (_, A) = frozen.t, self._missed(np.arange(len(self.root)), frozen)
+        Q = np.zeros((len(t), 6, 6))
+        Q[:, :3, :3] = (TURN_SHARE * sigma) ** 2 * np.eye(3)
+        across = (t**2).sum(axis=1)[:, None, None] * np.eye(3) - t[:, :, None] * t[:, None, :]
+        Q[:, 3:, 3:] = sigma**2 * across
+        return np.linalg.solve(np.linalg.cholesky(np.eye(9) + A @ Q @ A.transpose(0, 2, 1)), self.root)
 
 
 def _lengths(a: Floats, b: Floats, weight: Floats) -> Floats:

@@ -34,6 +34,8 @@ from smartnav_graph.vision.pairs import Pairs, pairs_of_matches, pairs_of_tracks
 
 # Sigma of the rotation between two images, rad and rad/s: remaining bias and noise of the gyro.
 TURN_SIGMA, TURN_DRIFT = float(np.radians(0.1)), float(np.radians(0.05))
+# Sigma (rad) of the direction of a baseline beside the noise of its matches, among the noise scales of a pass.
+SHARED = "image_direction"
 # The builder that replaces pairs once they are settled and its own tracks are tested.
 SMART = "smart"
 # Share of its matches that a pair must keep.
@@ -82,8 +84,9 @@ REASONS = (
     "too few matches",
     "insufficient baseline",
     "inconsistent with the other sensors",
+    "observations are in shorter pairs",
 )
-IN_USE, OUTSIDE, FEW, STILL, CONTRARY = range(len(REASONS))
+IN_USE, OUTSIDE, FEW, STILL, CONTRARY, COPIED = range(len(REASONS))
 
 
 @dataclass(frozen=True)
@@ -223,15 +226,18 @@ class CoplanarityBuilder(Builder):
 
     def _model(self, pass_state: PassState) -> RowModel:
         """The row model of a pass: made again where the selection or the noise changed."""
-        by = (self.selection(pass_state), pass_state.tests(self.name), pass_state.scale(self.name))
+        scales = pass_state.scale(self.name), pass_state.noise_scales.get(SHARED, 0.0)
+        by = (self.selection(pass_state), pass_state.tests(self.name), scales)
         if self._made is None or self._made[0][0] is not by[0] or self._made[0][1:] != by[1:]:
             self._made = (by, self._new_model(pass_state))
         return self._made[1]
 
     def _new_model(self, pass_state: PassState) -> RowModel:
         sigma, selection = self.sigma * pass_state.scale(self.name), self.selection(pass_state)
+        shared = pass_state.noise_scales.get(SHARED, 0.0)
         if pass_state.tests(self.name) == COMPRESSED and selection.poses is not None:
-            return CompressedRows(selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE, selection.poses)
+            matched = selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE
+            return CompressedRows(*matched, selection.poses, shared)
         return PairRows(selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE)
 
     # --- when rows were seen ---
@@ -262,7 +268,7 @@ class CoplanarityBuilder(Builder):
             delay = self.camera_model.delay(x)
             xy.append(seen_from(x, self.camera_model.turns(self.rates, stamps[place], delay, motion.gyro_bias[place])))
             way.append(speed[place] * delay[:, None])
-        first = motion.nav_R_body[pairs.images[pairs.pair, 0]] @ self.rig.body_R_cam
+        first = motion.nav_R_body[pairs.images[pairs.pair, 0]] @ self.camera_model.body_R_cam
         return replace(pairs, x0=xy[0], x1=xy[1], shift=rotate(first.transpose(0, 2, 1), way[1] - way[0]))
 
     # --- which matches ---
@@ -276,7 +282,7 @@ class CoplanarityBuilder(Builder):
         assert isinstance(model, PairRows)
         if not len(ending):
             return
-        C = self.rig.body_R_cam
+        C = self.camera_model.body_R_cam
         turns = [self._turn[int(i)].T @ self._turn[int(j)] for i, j in self.seen.images[ending]]
         some = self._at_once(self.seen.of(ending), 0.0, selection.rate, selection.motion)
         if some.shift is not None:

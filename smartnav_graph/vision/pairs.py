@@ -74,6 +74,10 @@ class Pairs:
         shift = None if self.shift is None else self.shift[mine]
         return Pairs(self.t_ns, self.images[rows], self.x0[mine], self.x1[mine], pair, shift)
 
+    def until(self, t_ns: int) -> Pairs:
+        """The pairs whose second image is no later."""
+        return self.of(np.flatnonzero(self.t_ns[self.images[:, 1]] <= t_ns))
+
     def padded(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
         """One value or row a match (m, ...) as (n, k, ...); zero in empty entries."""
         if not len(values):

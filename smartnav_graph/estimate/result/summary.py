@@ -21,11 +21,12 @@ from smartnav_graph.estimate.result.score_tests import Unmodelled
 from smartnav_graph.estimate.result.verdict import VerdictInputs, verdict
 from smartnav_graph.estimate.reweight.false_standstills import refuted_text
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
+from smartnav_graph.estimate.reweight.image_weight import weight_text
 from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.track_outliers import track_account
 from smartnav_graph.estimate.reweight.update import OBSERVED
-from smartnav_graph.factors.coplanarity import SMART
+from smartnav_graph.factors.coplanarity import SHARED, SMART
 from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.solution import POS, Solution
@@ -94,7 +95,7 @@ def summarise(
     mode = POSITIONS_ONLY if problem.positions_only else mode
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
-    refused = [one.refused for one in (seen, tracks) if one is not None and one.refused]
+    refused = [one.refused for one in (seen, tracks) if one is not None and one.refused] + weight_text(pass_state)
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
     summary: dict[str, Any] = {
@@ -114,6 +115,7 @@ def summarise(
         "cost": estimate.cost,
         "states": _states(solved),
         "clock": problem.clocks.to_dict(),
+        "camera": _camera(problem, pass_state),
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),
@@ -192,6 +194,13 @@ def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
             sigma = builder.scaled_sigma(pass_state)[row]
             found[f"{builder.name}_sigma_m"] = _state([round(float(s), 4) for s in sigma])
     return found
+
+
+def _camera(problem: Problem, pass_state: PassState) -> dict[str, Any]:
+    """The camera beside the gyroscope, and the error of the direction of image pairs that the others ask for."""
+    turns, shared = problem.camera_turns, pass_state.noise_scales.get(SHARED, 0.0)
+    found: dict[str, Any] = {} if turns is None else dict(turns.to_dict())
+    return found | ({"direction_sigma_deg": round(float(np.degrees(shared)), 3)} if shared else {})
 
 
 def _state(value: object, sigma: object = None, *, held: bool = False) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.so3 import exp
-from smartnav_graph.estimate.reweight.image_pair_outliers import Account
-from smartnav_graph.factors.camera import BORESIGHT, STREAM
+from smartnav_graph.estimate.reweight.image_pair_outliers import Account, camera_states
 from smartnav_graph.factors.coplanarity import COMPRESSED, CoplanarityBuilder
 from smartnav_graph.factors.smart import (
     CONTRARY,
@@ -55,7 +54,7 @@ def check_tracks(builders: Iterable[Builder], estimate: Estimate, pass_state: Pa
         return pass_state
     tests, seen, before = pass_state.tests(builder.name), builder.sightings, builder.selection(pass_state)
     if not tests:
-        before = replace(before, boresight=estimate.session_value(BORESIGHT, 3))
+        before = replace(before, boresight=camera_states(builder.camera_model, estimate)[1])
     views = _views(builder, before, estimate)
     use = seen.there & views.known
     points = triangulate(seen, views.then, builder.sigma * pass_state.scale(builder.name), use)
@@ -102,7 +101,7 @@ def _views(builder: SmartBuilder, selection: TrackSelection, estimate: Estimate)
     place, known = estimate.keyframes_at(stamps, builder.merge_ns)
     known[1:] &= place[1:] != place[:-1]  # one image a keyframe
     R, p, v, bias = (x[place][seen.image.ravel()] for x in estimate.states())
-    delay = estimate.offset_s(STREAM) + builder.camera_model.delay(seen.xy.reshape(-1, 2))
+    delay = camera_states(builder.camera_model, estimate)[0] + builder.camera_model.delay(seen.xy.reshape(-1, 2))
     turn = builder.rates.turn(stamps[seen.image.ravel()], delay) - bias[:, 3:] * delay[:, None]
     later, on = R @ exp(turn), p + v * delay[:, None]
     at_once, then = (_camera(builder, selection, *pose) for pose in ((R, p), (later, on)))

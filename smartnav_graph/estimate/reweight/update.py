@@ -22,6 +22,7 @@ from smartnav_graph.core.arrays import Mask, runs
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
 from smartnav_graph.estimate.reweight.image_pair_outliers import check_pairs
+from smartnav_graph.estimate.reweight.image_weight import weigh_images
 from smartnav_graph.estimate.reweight.imu_noise import RELAXATION, noise_scales, worse_than_class
 from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
 from smartnav_graph.estimate.reweight.outliers import (
@@ -87,6 +88,7 @@ def update_pass_state(
         return new, done
     tested = check_pairs(builders, estimate, new)
     tested = check_tracks(builders, estimate, tested) if tested is new else tested
+    tested = weigh_images(builders, estimate, new) if done and tested is new else tested
     if done and tested is new:
         tested = drop_standstills(builders, windows, estimate, new)
     return tested, done and tested is new
@@ -233,11 +235,14 @@ def _inertial(
     """`new` with the inertial noise found, and whether that changed little. Beside correlated fixes it is no less than
     that of the class: the solution follows slow errors of the sensor as it follows those of the fixes, and residuals
     show the fast part.
-    Beside images and constraints of a vehicle too: these are better, or kept to less, than their sigma says."""
+    Beside constraints of a vehicle too: these are kept to less than their sigma says. Beside images it stays as it was
+    without them: it would grow and hide what contradicts them (`image_weight`)."""
     scales = noise_scales(builders, windows, estimate, pass_state, level)
     if any(builder.has_correlated_error(pass_state) for builder in position_builders(builders)):
         scales = {name: max(scale, 1.0) for name, scale in scales.items()}
-    if pass_state.outlier_tests or one_of(builders, VehicleBuilder) is not None:
+    if pass_state.outlier_tests:
+        scales = {}
+    if one_of(builders, VehicleBuilder) is not None:
         scales = {name: max(scale, min(1.0, pass_state.scale(name))) for name, scale in scales.items()}
     if pass_state.stage == LAST_STAGE:
         scales |= row_scales(builders, estimate, pass_state)

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.so3 import chained
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
 
@@ -93,26 +94,8 @@ def step_means(imu: Imu) -> tuple[Floats, Floats]:
 
 
 def _attitude(gyro: Floats) -> Rotation:
-    """Attitude (n,) in the middle of each step, in a frame that does not turn: products of all turns before."""
-    q = Rotation.from_rotvec(STEP_S * gyro).as_quat().T.copy()
-    count = 1
-    while count < q.shape[1]:  # each holds the product of `count` turns
-        q[:, count:] = _product(q[:, :-count], q[:, count:])
-        count *= 2
-    return Rotation.from_quat(_product(q, Rotation.from_rotvec(-0.5 * STEP_S * gyro).as_quat().T).T)
-
-
-def _product(p: Floats, q: Floats) -> Floats:
-    """Product (4, n) of quaternions x y z w."""
-    (a, b, c, d), (x, y, z, w) = p, q
-    return np.stack(
-        [
-            d * x + a * w + b * z - c * y,
-            d * y - a * z + b * w + c * x,
-            d * z + a * y - b * x + c * w,
-            d * w - a * x - b * y - c * z,
-        ]
-    )
+    """Attitude (n,) in the middle of each step, in a frame that does not turn."""
+    return chained(STEP_S * gyro) * Rotation.from_rotvec(-0.5 * STEP_S * gyro)
 
 
 def _vertical(force: Floats, width_s: float) -> Floats:

@@ -1,0 +1,73 @@
+"""Weight of image pairs beside the other sensors.
+
+Residuals of matches show the noise of a match. What is wrong with a pair as a whole, or lasts over many (calibration,
+motion within the exposure, one observation in pairs of several spans), they do not show: it bends the solution until
+inertial data and fixes contradict their noise. So an error of direction that the matches of a pair share is assumed to
+be the larger, the more these do, by the chi-square of each over its own redundancy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.factors.coplanarity import COMPRESSED, COPIED, IN_USE, SHARED, CoplanarityBuilder
+from smartnav_graph.factors.imu import ImuBuilder
+from smartnav_graph.graph.pass_state import PassState
+from smartnav_graph.graph.update import Builder, one_of
+from smartnav_graph.smoothers.estimate import Estimate
+from smartnav_graph.smoothers.redundancy import redundancies
+
+# Chi-square over redundancy from which on a sensor contradicts the images, how rarely one that agrees reaches it.
+CONTRARY, RARE = 1.1, 1e-3
+# First and largest sigma of the direction, rad, and the least and most that it grows by in a pass.
+FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(2.0))
+STEP = (1.3, 3.0)
+
+
+def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
+    """The pass state with a larger error of the direction of image pairs where others contradict them."""
+    builders = list(builders)
+    pairs = one_of(builders, CoplanarityBuilder)
+    if pairs is None or pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused:
+        return pass_state
+    imu = one_of(builders, ImuBuilder)
+    names = {builder.name for builder in position_builders(builders)} | ({imu.name} if imu is not None else set())
+    found = [one for name, one in redundancies(estimate).items() if name in names]
+    fits = [(one.square, one.residuals - one.fitted) for one in found]
+    worst = max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < RARE), default=1.0)
+    before = pass_state.noise_scales.get(SHARED, 0.0)
+    if worst < CONTRARY or before >= LARGEST:
+        return pass_state
+    wanted = FIRST if before == 0.0 else min(before * float(np.clip(np.sqrt(worst), *STEP)), LARGEST)
+    pass_state = replace(pass_state, noise_scales={**pass_state.noise_scales, SHARED: wanted})
+    return _counted_once(pairs, pass_state) if before == 0.0 else pass_state
+
+
+def weight_text(pass_state: PassState) -> list[str]:
+    """A warning where image pairs count for less than the noise of their matches."""
+    shared = pass_state.noise_scales.get(SHARED, 0.0)
+    text = (
+        "image_pairs: inertial data and fixes contradict the motion between images, whose direction counts as "
+        f"{np.degrees(shared):.1f} deg uncertain, and each observation once; check the calibration of the camera"
+    )
+    return [text] if shared else []
+
+
+def _counted_once(pairs: CoplanarityBuilder, pass_state: PassState) -> PassState:
+    """The pass state without the pairs whose time holds shorter ones in use: their observations are in these."""
+    selection = pairs.selection(pass_state)
+    used = np.flatnonzero(selection.verdict == IN_USE)
+    first, last = pairs.seen.images[used].T
+    latest = np.full(int(last.max(initial=0)) + 2, -1)  # latest first image of the pairs that end at or before an image
+    np.maximum.at(latest, last, first)
+    latest = np.maximum.accumulate(latest)
+    verdict = selection.verdict.copy()
+    verdict[used[latest[last] > first]] = COPIED
+    use = selection.use & (verdict == IN_USE)[:, None]
+    selection = replace(selection, verdict=verdict, use=use)
+    return replace(pass_state, selections={**pass_state.selections, pairs.name: selection})
