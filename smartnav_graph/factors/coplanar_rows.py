@@ -30,7 +30,7 @@ from smartnav_graph.vision.epipolar import Sampson, cross, essential, rays, samp
 from smartnav_graph.vision.pairs import Pairs
 
 # Baselines (m) far below this say nothing: the speed of a hand that holds still, over a second.
-BASELINE_FLOOR_M = 1e-3
+BASELINE_FLOOR_M = 1e-6
 # Parts of the normal equations smaller than this share of the largest are rounding.
 ROUNDING = 1e-12
 # Error of the rotation that all matches of a pair share, in units of that of the direction of the baseline.

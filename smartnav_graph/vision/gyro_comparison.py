@@ -58,7 +58,7 @@ class GyroComparison:
     the first to the last part of the recording, zero where that is not significant
     sharpness : sigmas by which the next best offset fits worse
     boresight, boresight_sigma (3,) rad, camera axes : of the axes of the camera, C = body_R_cam Exp(boresight)
-    sound : share of the pairs that agree with the gyroscope; pairs : number compared
+    gyro_bias (3,) rad/s; sound : share of the pairs that agree with the gyroscope; pairs : number compared
     """
 
     offset_s: float
@@ -67,6 +67,7 @@ class GyroComparison:
     sharpness: float
     boresight: Floats
     boresight_sigma: Floats
+    gyro_bias: Floats
     sound: float
     pairs: int
 
@@ -117,7 +118,7 @@ def compare_with_gyro(pairs: Pairs, imu: Imu, camera: Camera, mount: Mount) -> G
         turns = _Turns(imu, bias)
         if np.abs(step).max() < CONVERGED:
             break
-    return _comparison(problem, problem.at(turns, x), x, sharpness)
+    return _comparison(problem, problem.at(turns, x), x, bias, sharpness)
 
 
 def contradictions(found: GyroComparison | None, camera: Camera) -> Iterator[Finding]:
@@ -138,7 +139,7 @@ def contradictions(found: GyroComparison | None, camera: Camera) -> Iterator[Fin
         yield Finding("images", text, "estimated from there; calibrate its mount", verdict="good", size=found.turned_by)
 
 
-def _comparison(problem: _Problem, found: _Rotations, x: Floats, sharpness: float) -> GyroComparison:
+def _comparison(problem: _Problem, found: _Rotations, x: Floats, bias: Floats, sharpness: float) -> GyroComparison:
     covariance = np.linalg.inv(found.normal.sum(axis=0) + PRIOR)
     parts = [part for part in np.array_split(np.argsort(problem.t0), _blocks(len(problem.t0))) if len(part)]
     weight = np.array([found.normal[part, 6, 6].sum() for part in parts]) + 1e-12
@@ -160,6 +161,7 @@ def _comparison(problem: _Problem, found: _Rotations, x: Floats, sharpness: floa
         sharpness,
         x[:3],
         np.sqrt(np.diagonal(covariance)[:3]) * worse,
+        bias,
         float(found.sound.mean()),
         len(problem.t0),
     )

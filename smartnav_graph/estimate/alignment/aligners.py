@@ -13,11 +13,13 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.alignment.first_stretch import OPEN_SIGMA, Candidate, FirstStretch
 from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.alignment.static import inertial_curve, kabsch_attitude
+from smartnav_graph.graph.states import State
 
 # Lengths (s) of the fitted curve: a short one suffers less from an unknown gyro bias, a long one from noise.
 CURVE_S = (12.0, np.inf)
@@ -64,6 +66,28 @@ def static_alignment(first: FirstStretch) -> list[Candidate]:
     stretch_s = max(rest.length_s, first.field_start.length_s if first.field_start is not None else 0.0)
     final = InitialState(prior, "static", sentence, heading, sigma, stretch_s, 1, first.pass_state)
     return [Candidate(prior.start, final)]
+
+
+def visual_alignment(first: FirstStretch) -> list[Candidate]:
+    """Without any position and rest: gravity and velocity by images (`visual.visual_start`), heading and position
+    zero."""
+    found = first.visual
+    if found is None or first.rest is not None:
+        return []
+    R = frames.nav_R_body_from_heading(0.0, -found.gravity, first.forward)
+    velocity = R @ found.velocity
+    state = State.of(0, first.start_ns, (R, np.zeros(3), velocity), found.bias)
+    tilt = first.noise.accel_bias_sigma / first.gravity
+    sigma_rot, sigma_v = np.array([tilt, tilt, 1e-3]), float(np.linalg.norm(found.velocity_sigma))
+    prior = first.prior(
+        state, sigma_rot=sigma_rot, sigma_pos=np.full(3, 1e-3), sigma_vel=np.full(3, sigma_v), velocity_mean=velocity
+    )
+    sentence = (
+        f"No absolute sensor and no rest: started in motion at {np.linalg.norm(velocity):.2f} m/s +- {sigma_v:.2f} m/s "
+        f"by images and inertial data of {found.length_s:.0f} s; heading and position set to zero (local frame)."
+    )
+    final = InitialState(prior, "visual", sentence, 0.0, 0.1, found.length_s, 1, first.pass_state)
+    return [Candidate(state, final)]
 
 
 def pedestrian_alignment(first: FirstStretch) -> list[Candidate]:
@@ -125,6 +149,7 @@ class Aligner(NamedTuple):
 ALIGNERS: Mapping[str, Aligner] = {
     "user": Aligner(user_start, alone=True),
     "static": Aligner(static_alignment, alone=True),
+    "visual": Aligner(visual_alignment, alone=True),
     "pedestrian": Aligner(pedestrian_alignment, alone=True),
     "attitude": Aligner(attitude_alignment),
     "magnetic": Aligner(magnetic_alignment),

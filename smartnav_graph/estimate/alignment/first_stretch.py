@@ -19,6 +19,7 @@ from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig, In
 from smartnav_graph.estimate.alignment.magnetic import FieldStart
 from smartnav_graph.estimate.alignment.pedestrian import Walk
 from smartnav_graph.estimate.alignment.static import LEAST_RATE_SIGMA, Rest, find_rest, rest_over
+from smartnav_graph.estimate.alignment.visual import VisualStart
 from smartnav_graph.factors.prior import PriorBuilder, PriorConfig
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.states import State
@@ -78,7 +79,8 @@ class FirstStretch:
     standstill : factors of their own hold a rest at the start; rest_end_ns : end of a standstill given for the start
     iron_sigma : hard iron (uT) that the magnetometer may still have; magnetic_stage : stage of its factors, None where
     they are not used; field_start, attitude_start, walk : alignments by magnetic field and gravity, by attitudes of
-    pose fixes, by the steps of a pedestrian; user : given by the user
+    pose fixes, by the steps of a pedestrian; visual : by images, where nothing else gives a start; user : given by the
+    user
     pass_state : of the first pass
     """
 
@@ -101,6 +103,7 @@ class FirstStretch:
     field_start: FieldStart | None = None
     attitude_start: AttitudeStart | None = None
     walk: Walk | None = None
+    visual: VisualStart | None = None
     user: UserStart | None = None
     pass_state: PassState = field(default_factory=PassState)
     count: int = 0

@@ -15,8 +15,10 @@ from smartnav_graph.estimate.alignment.initial_state import UserStart
 from smartnav_graph.estimate.alignment.magnetic import field_start
 from smartnav_graph.estimate.alignment.multilateration import multilaterate
 from smartnav_graph.estimate.alignment.pedestrian import SPARSE_S, Walk, walked
+from smartnav_graph.estimate.alignment.visual import VisualStart, visual_start
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.magnetometer import IRON, MagnetometerBuilder
 from smartnav_graph.factors.pedestrian import StepBuilder
@@ -47,6 +49,7 @@ def first_stretch(problem: Problem, longest_s: float | None = None) -> FirstStre
         weak=problem.config.prior,
         standstill=problem.rests_at_start,
         attitude_start=_oriented(problem, causal=causal),
+        visual=None if len(fixes) else _seen(problem),
         walk=_walked(problem, fixes, config.max_stretch_s if causal else None),
         rest_end_ns=_standing(problem, config.rest_s),
         user=UserStart.parse(problem.config.run.initial) if problem.config.run.initial else None,
@@ -86,6 +89,16 @@ def _walked(problem: Problem, fixes: Fixes, causal_s: float | None) -> Walk | No
         steps.model.body_R_vehicle,
         noise.step_noise,
     )
+
+
+def _seen(problem: Problem) -> VisualStart | None:
+    """The start by images and inertial data."""
+    builder, turns = one_of(problem.builders, CoplanarityBuilder), problem.camera_turns
+    if builder is None:
+        return None
+    session, bias = problem.session, np.zeros(3) if turns is None else turns.gyro_bias
+    start_ns, noise = problem.windows[0].t1_ns, problem.calibration.imu_noise
+    return visual_start(builder, session.require_imu(), start_ns, session.gravity, noise, bias)
 
 
 def _oriented(problem: Problem, *, causal: bool) -> AttitudeStart | None:
