@@ -42,6 +42,8 @@ SMART = "smart"
 LEAST_SHARE = 0.5
 # Tests until matches are settled: by the rotation, at states found with images, again and compressed.
 COMPRESSED = 3
+# Sigma of the velocity in a replay, as a share of it and m/s, from which on a pair is not used.
+OPEN_SHARE, LEAST_OPEN = 0.5, 0.5
 # Degrees of freedom of the relative pose of a pair.
 POSE_DOF = 5
 LEAST_MATCHES = 6  # of a pair
@@ -165,7 +167,8 @@ class CoplanarityBuilder(Builder):
         ending = self._ending(image)
         if self._causal is not None and pass_state.causal:
             self._see_now(self._causal.rate, self._causal.motion, image, update)
-            self._select_now(self._causal, self._model(pass_state), ending)
+            if not _unknown_speed(previous):
+                self._select_now(self._causal, self._model(pass_state), ending)
         self._add_pairs(update, ending, pass_state)
 
     def renew(self, update: GraphUpdate, pass_state: PassState) -> None:
@@ -303,6 +306,14 @@ class CoplanarityBuilder(Builder):
         few = (pairs.count < LEAST_MATCHES) | ((share >= LEAST_SHARE) & (kept < LEAST_MATCHES))
         still, contrary = parallax < self.config.least_parallax * self.sigma, share < LEAST_SHARE
         return np.select([few, still, contrary], [FEW, STILL, CONTRARY], IN_USE).astype(np.intp)
+
+
+def _unknown_speed(state: State | None) -> bool:
+    """Whether a replay does not know speed and heading yet: pairs would fit a motion of any length and direction."""
+    if state is None or state.covariance is None:
+        return False
+    sigma = float(np.sqrt(np.trace(state.covariance[6:9, 6:9])))
+    return sigma > max(OPEN_SHARE * float(np.linalg.norm(state.nav.velocity())), LEAST_OPEN)
 
 
 def pairs_of(session: Session, config: CoplanarityConfig, *, smart: bool = False) -> Pairs | None:

@@ -26,6 +26,7 @@ from smartnav_graph.estimate.reweight.imu_noise import NOISE_NAMES
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.track_outliers import track_account
 from smartnav_graph.estimate.reweight.update import OBSERVED
+from smartnav_graph.factors.camera import STREAM
 from smartnav_graph.factors.coplanarity import SHARED, SMART
 from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.graph.pass_state import PassState
@@ -178,6 +179,9 @@ def _states(solved: SolvedProblem) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for state in estimate.session.values():
         sigma = state.prior_sigma if state.held else state.sigma
+        if state.name == f"{STREAM}_time_offset_s" and problem.camera_turns is not None and problem.camera_turns.known:
+            turns = problem.camera_turns  # a clock that drifts has no offset that is better known than turns show it
+            sigma = np.hypot(sigma, max(turns.sigma_s, abs(float(state.value[0]) - turns.offset_s)))
         value, spread = ([round(float(x), 6) for x in numbers] for numbers in (state.value, sigma))
         alone = len(value) == 1
         pair = (value[0], spread[0]) if alone else (value, spread)

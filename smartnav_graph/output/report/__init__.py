@@ -75,6 +75,7 @@ def report_markdown(summary: Summary, evaluation: Evaluation | None = None) -> s
     tables = [
         ("Measurements used", why, usage.used_table(summary, {})),
         ("Image pairs", "", usage.outcomes_table(summary, "image_pairs", "image pairs")),
+        ("Camera beside the gyroscope", "\n".join(f"- {line}" for line in usage.camera_lines(summary)), None),
         ("IMU data gaps", gaps, None),
         ("Withheld measurements", "", usage.withheld_table(summary)),
     ]

@@ -173,6 +173,7 @@ def used(session: Session, solution: Solution, summary: Summary) -> str:
             )
             if table
         ),
+        *(f"<p>{escape(line)}</p>" for line in usage.camera_lines(summary)),
         f"<p>{escape(small)}</p>" if small else "",
         '<p class="fine">χ² / dof: sum of the squared residuals over their sigmas, divided by the redundancy; '
         "expected 1.</p>",

@@ -78,6 +78,22 @@ def outcomes_table(summary: Summary, key: str, things: str) -> Table:
     return Table((f"{count(total)} {things}", "Count", "Share"), rows)
 
 
+def camera_lines(summary: Summary) -> list[str]:
+    """What the camera shows beside the gyroscope, and what other sensors make of it."""
+    camera, lines = table_of(summary, "camera"), list[str]()
+    offset, sigma, share = (as_float(camera.get(name)) for name in ("clock_offset_s", "clock_sigma_s", "sound_share"))
+    if offset is not None and sigma is not None and camera.get("known"):
+        lines.append(f"Clock offset beside the calibrated one: {1e3 * offset:.1f} ms, 1 sigma {1e3 * sigma:.1f} ms.")
+        lines.append(f"{number(100.0 * (share or 0.0), 3)} % of the image pairs agree with the turns of the gyroscope.")
+    elif offset is not None:
+        lines.append("Clock offset not known: the camera turns too little.")
+    if (direction := as_float(camera.get("direction_sigma_deg"))) is not None:
+        lines.append(
+            f"Direction between images: {direction:.2f} deg uncertain beside the noise of matches."
+        )
+    return lines
+
+
 def rejections_table(summary: Summary) -> Table:
     """Every rejected measurement: time, sensor, size of the residual."""
     rows = []

@@ -1,0 +1,46 @@
+"""Cameras of others: each fault of a calibration or a start is found, or the images count for less."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import smartnav_graph as sn
+from smartnav_graph.core.so3 import best_rotation
+
+CASES = "vision_cases"
+
+
+@pytest.mark.parametrize("name", ["F3_car_klt_worse", "F3_car_orb"])
+def test_a_car_with_every_tenth_fix_is_better_for_its_images(dataset, name):
+    session = sn.load(dataset(CASES) / name)
+    run = sn.run(session, withhold=("gnss:every=10",), rate="10")
+    truth, found = session.reference, run.solution
+    rows, at = np.isin(found.t_ns, truth.t_ns), np.isin(truth.t_ns, found.t_ns)
+    off = (found.nav_t_body[rows] - truth.enu[at])[:, :2]
+    turned = Rotation.from_matrix(found.nav_R_body[rows]) * Rotation.from_quat(truth.quat[at], scalar_first=True).inv()
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.40  # m; 0.48 without images
+    assert np.degrees(np.sqrt((turned.as_rotvec()[:, 2] ** 2).mean())) < 0.35  # deg; 4.5 without images
+    inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance[rows, 3:5, 3:5]), off) < 5.99
+    assert inside.mean() > 0.8  # 0.42 to 0.58 where every pair counted in full
+    assert run.summary["camera"]["direction_sigma_deg"] >= 0.5
+    assert any("contradict the motion between images" in warning for warning in run.summary["warnings"])
+
+
+def test_a_camera_in_a_hand_without_rest_or_fix(dataset):
+    folder = dataset(CASES) / "handheld_no_rest"
+    session = sn.load(folder)
+    run = sn.run(session, rate="20")
+    clock = run.summary["states"]["images_time_offset_s"]
+    assert -0.06 < clock["value"] < -0.04 and clock["sigma"] > 0.002  # s; it drifts
+    assert run.summary["initialisation"]["method"] == "visual"
+    with (folder / "colmap_poses.csv").open() as file:
+        poses = [[float(row[name]) for name in ("t_ns", "x", "y", "z")] for row in csv.DictReader(file)]
+    t_ns, model = np.array(poses)[:, 0] + clock["value"] * 1e9, np.array(poses)[:, 1:]
+    place = np.stack([np.interp(t_ns, run.solution.t_ns, column) for column in run.solution.nav_t_body.T], axis=1)
+    R, values = best_rotation(model, place)
+    centred = model - model.mean(axis=0)
+    scale = float(values.sum() / (centred**2).sum())
+    left = place - place.mean(axis=0) - scale * centred @ R.T
+    assert 0.075 < scale < 0.115 and np.sqrt((left**2).sum(axis=1).mean()) < 0.05  # m a unit of the model; m
