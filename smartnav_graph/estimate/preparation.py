@@ -11,7 +11,7 @@ from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
 from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors.camera import UNKNOWN_CAMERA
+from smartnav_graph.factors.camera import UNKNOWN_CAMERA, readout_s
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.factors.coplanarity import pairs_of
 from smartnav_graph.factors.pose_fix import undo_latency
@@ -312,7 +312,8 @@ def compare_camera(session: Session, notes: Notes) -> Session:
     camera = notes.calibration.cameras.get(name, UNKNOWN_CAMERA)
     if notes.causal:
         pairs = pairs.until(notes.span[0] + round(INITIALISATION_S * NS))
-    notes.camera_turns = compare_with_gyro(pairs, session.require_imu(), camera, session.mount(name))
+    rows_s = readout_s(session, name, notes.calibration.cameras.get(name)) * notes.config.image_pairs.row_time
+    notes.camera_turns = compare_with_gyro(pairs, session.require_imu(), camera, session.mount(name), 0.5 * rows_s)
     for finding in contradictions(notes.camera_turns, camera):
         notes.findings, notes.warnings = [*notes.findings, finding], [*notes.warnings, str(finding)]
     return session

@@ -16,6 +16,7 @@ from smartnav_graph.factors.coplanar_rows import Rig
 from smartnav_graph.factors.gnss import clock_state
 from smartnav_graph.graph.states import SessionState
 from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Imu
 
 # States of the camera belong to this stream; the name of its correction in the body.
@@ -146,20 +147,20 @@ def make_camera_model(
     if seen is not None and context.camera_offset_s and seconds > 0:
         seconds = max(seen.sigma_s, LEAST_CLOCK_SIGMA_S)
     if seen is not None and degrees > 0 and seen.turned_by > np.radians(degrees):
-        turned = seen.boresight
+        turned = seen.turned
     rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0, known_s=context.camera_offset_s)
-    readout = _readout_s(context) if row_time else 0.0
+    readout = readout_s(context.session, context.camera_name, context.camera) if row_time else 0.0
     return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, turned)
 
 
-def _readout_s(context: FactorContext) -> float:
-    """Of the session's images as recorded, their median, else as calibrated; unknown without a calibration, which says
+def readout_s(session: Session, name: str, camera: Camera | None) -> float:
+    """Of a camera's images as recorded, their median, else as calibrated; unknown without a calibration, which says
     what row a point was in."""
-    if context.camera is None:
+    if camera is None:
         return 0.0
-    images = context.session.images
+    images = session.images
     if images is not None and images.readout_ns is not None:
-        own = images.readout_ns[images.camera.astype(str) == context.camera_name]
+        own = images.readout_ns[images.camera.astype(str) == name]
         if len(own):
             return float(np.median(own)) / NS
-    return context.camera.readout_s
+    return camera.readout_s

@@ -46,6 +46,7 @@ SEARCH_ROUNDS, ROUNDS, CONVERGED = 3, 15, 1e-4
 LINEAR_S, CLEAR = 0.01, 2.0
 # What the boresight of a camera that was calibrated seems to be, rad.
 LEAST_BORESIGHT_SIGMA = float(np.radians(0.25))
+SHOWN = 0.2  # of its prior sigma: that of a boresight that the turns show
 TABLE_S = 0.01  # step of the integrated rates
 MOST_BLOCKS = 8  # parts of the recording that the offset is found in
 
@@ -77,10 +78,17 @@ class GyroComparison:
         return self.sharpness > SHARP
 
     @property
+    def turned(self) -> Floats:
+        """Boresight (3,) rad, zero in the components that are not certain: about the axis that a camera turns about it
+        does not show."""
+        sigma = np.hypot(self.boresight_sigma, LEAST_BORESIGHT_SIGMA)
+        sure = self.known & (np.abs(self.boresight) > 3.0 * sigma) & (self.boresight_sigma < SHOWN * BORESIGHT_SIGMA)
+        return np.where(sure, self.boresight, 0.0)
+
+    @property
     def turned_by(self) -> float:
-        """Largest component (rad) of the boresight that is certain, zero for none."""
-        sure = self.known & (np.abs(self.boresight) > 3.0 * np.hypot(self.boresight_sigma, LEAST_BORESIGHT_SIGMA))
-        return float(np.abs(self.boresight[sure]).max(initial=0.0))
+        """Its largest component, rad."""
+        return float(np.abs(self.turned).max())
 
     def to_dict(self) -> dict[str, object]:
         """As in summary.json."""
@@ -97,10 +105,15 @@ class GyroComparison:
         }
 
 
-def compare_with_gyro(pairs: Pairs, imu: Imu, camera: Camera, mount: Mount) -> GyroComparison | None:
-    """Compare the pairs of a camera with the gyroscope, beside its calibration; None where too few pairs can be."""
+def compare_with_gyro(
+    pairs: Pairs, imu: Imu, camera: Camera, mount: Mount, row_s: float = 0.0
+) -> GyroComparison | None:
+    """Compare the pairs of a camera with the gyroscope, beside its calibration; None where too few pairs can be.
+
+    row_s : time (s) from the first row of an image to the middle one, where rows have their own time
+    """
     turns, body_R_cam = _Turns(imu, np.zeros(3)), np.array(mount.body_R, dtype=np.float64)
-    problem = _Problem.of(pairs, turns, body_R_cam, camera.noise, camera.time_offset_s)
+    problem = _Problem.of(pairs, turns, body_R_cam, camera.noise, camera.time_offset_s + row_s)
     if problem is None:
         return None
     offsets = np.arange(-SEARCH_S, SEARCH_S + 0.5 * SEARCH_STEP_S, SEARCH_STEP_S)
@@ -134,7 +147,7 @@ def contradictions(found: GyroComparison | None, camera: Camera) -> Iterator[Fin
         text = f"the clock of the camera drifts by {1e3 * found.drift_s:.0f} ms against the gyroscope"
         yield Finding("images", text, "the offset is an average; use one clock", verdict="good", size=found.drift_s)
     if found.turned_by > CLEAR * np.radians(camera.boresight_sigma_deg):
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(found.boresight))
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(found.turned))
         text = f"the camera is turned by {angles} deg about its axes by the gyroscope"
         yield Finding("images", text, "estimated from there; calibrate its mount", verdict="good", size=found.turned_by)
 

@@ -88,9 +88,7 @@ def camera_lines(summary: Summary) -> list[str]:
     elif offset is not None:
         lines.append("Clock offset not known: the camera turns too little.")
     if (direction := as_float(camera.get("direction_sigma_deg"))) is not None:
-        lines.append(
-            f"Direction between images: {direction:.2f} deg uncertain beside the noise of matches."
-        )
+        lines.append(f"Direction between images: {direction:.2f} deg uncertain beside the noise of matches.")
     return lines
 
 
