@@ -43,7 +43,7 @@ LONGEST_S, LEAST_MATCHES, MOST_MATCHES, LEAST_PAIRS, MOST_PAIRS = 2.5, 8, 40, 20
 BORESIGHT_SIGMA, BIAS_SIGMA, LOSS_SCALE = float(np.radians(3.0)), 0.05, 2.0
 SEARCH_ROUNDS, ROUNDS, CONVERGED = 3, 15, 1e-4
 # A clock offset below this (s) is estimated as a state alone: motion is linear over it. Sigmas that contradict.
-LINEAR_S, CLEAR = 0.01, 2.0
+LINEAR_S, CLEAR = 0.025, 2.0
 # What the boresight of a camera that was calibrated seems to be, rad.
 LEAST_BORESIGHT_SIGMA = float(np.radians(0.25))
 SHOWN = 0.2  # of its prior sigma: that of a boresight that the turns show
