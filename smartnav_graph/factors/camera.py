@@ -84,7 +84,7 @@ class CameraModel:
 
     camera : its calibration, or a substitute; readout_s : from its first row to its last, zero where rows
     are taken as seen at once; boresight_sigma rad, clock_sigma s : priors of its states, zero for none
-    turned (3,) rad : the boresight that is expected
+    expected_boresight (3,) rad : the boresight that is expected
     """
 
     camera: Camera
@@ -92,7 +92,7 @@ class CameraModel:
     readout_s: float
     boresight_sigma: float
     clock_sigma: float
-    turned: Floats = field(default_factory=lambda: np.zeros(3))
+    expected_boresight: Floats = field(default_factory=lambda: np.zeros(3))
 
     def states(self) -> Mapping[str, SessionState]:
         """Session states of the camera, by letter."""
@@ -100,13 +100,13 @@ class CameraModel:
         if self.rig.timed:
             found["T"] = clock_state(STREAM, self.clock_sigma, self.rig.known_s)
         if self.rig.boresight:
-            found["A"] = SessionState("A", STREAM, BORESIGHT, self.turned, np.full(3, self.boresight_sigma))
+            found["A"] = SessionState("A", STREAM, BORESIGHT, self.expected_boresight, np.full(3, self.boresight_sigma))
         return found
 
     @property
     def body_R_cam(self) -> Floats:
         """Axes of the camera (3, 3) as they are expected."""
-        return np.asarray(self.rig.body_R_cam @ exp(self.turned))
+        return np.asarray(self.rig.body_R_cam @ exp(self.expected_boresight))
 
     def delay(self, xy_n: Floats) -> Floats:
         """When points (m, 2) were seen, s (m,) after the first row of their image."""
@@ -143,14 +143,14 @@ def make_camera_model(
     degrees = camera.boresight_sigma_deg if boresight_sigma_deg is None else boresight_sigma_deg
     seconds = camera.time_offset_sigma_s if time_offset_sigma is None else time_offset_sigma
     body_R, body_t = np.array(mount.body_R, dtype=np.float64), np.array(mount.body_t, dtype=np.float64)
-    turned, seen = np.zeros(3), context.camera_turns
+    expected_boresight, seen = np.zeros(3), context.camera_turns
     if seen is not None and context.camera_offset_s and seconds > 0:
         seconds = max(seen.sigma_s, LEAST_CLOCK_SIGMA_S)
     if seen is not None and degrees > 0 and seen.turned_by > np.radians(degrees):
-        turned = seen.turned
+        expected_boresight = seen.certain_boresight
     rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0, known_s=context.camera_offset_s)
     readout = readout_s(context.session, context.camera_name, context.camera) if row_time else 0.0
-    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, turned)
+    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, expected_boresight)
 
 
 def readout_s(session: Session, name: str, camera: Camera | None) -> float:

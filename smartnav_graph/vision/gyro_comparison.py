@@ -78,7 +78,7 @@ class GyroComparison:
         return self.sharpness > SHARP
 
     @property
-    def turned(self) -> Floats:
+    def certain_boresight(self) -> Floats:
         """Boresight (3,) rad, zero in the components that are not certain: about the axis that a camera turns about it
         does not show."""
         sigma = np.hypot(self.boresight_sigma, LEAST_BORESIGHT_SIGMA)
@@ -88,7 +88,7 @@ class GyroComparison:
     @property
     def turned_by(self) -> float:
         """Its largest component, rad."""
-        return float(np.abs(self.turned).max())
+        return float(np.abs(self.certain_boresight).max())
 
     def to_dict(self) -> dict[str, object]:
         """As in summary.json."""
@@ -117,7 +117,7 @@ def compare_with_gyro(
     if problem is None:
         return None
     offsets = np.arange(-SEARCH_S, SEARCH_S + 0.5 * SEARCH_STEP_S, SEARCH_STEP_S)
-    costs = np.array([problem.settled(turns, offset) for offset in offsets])
+    costs = np.array([problem.cost_at(turns, offset) for offset in offsets])
     best = int(costs.sum(axis=1).argmin())
     more = costs[np.abs(offsets - offsets[best]) > APART_S] - costs[best]
     sharpness = float((more.mean(axis=1) / np.maximum(more.std(axis=1), 1e-12)).min() * np.sqrt(more.shape[1] / 2.0))
@@ -147,7 +147,7 @@ def contradictions(found: GyroComparison | None, camera: Camera) -> Iterator[Fin
         text = f"the clock of the camera drifts by {1e3 * found.drift_s:.0f} ms against the gyroscope"
         yield Finding("images", text, "the offset is an average; use one clock", verdict="good", size=found.drift_s)
     if found.turned_by > CLEAR * np.radians(camera.boresight_sigma_deg):
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(found.turned))
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(found.certain_boresight))
         text = f"the camera is turned by {angles} deg about its axes by the gyroscope"
         yield Finding("images", text, "estimated from there; calibrate its mount", verdict="good", size=found.turned_by)
 
@@ -260,7 +260,7 @@ class _Problem(NamedTuple):
         some = Pairs(some.t_ns, some.images, some.x0[kept], some.x1[kept], some.pair[kept])
         return cls(some, t0[rows], t1[rows], body_R_cam, sigma)
 
-    def settled(self, turns: _Turns, offset: float) -> Floats:
+    def cost_at(self, turns: _Turns, offset: float) -> Floats:
         """Cost (n,) of the pairs at an offset, boresight and bias estimated."""
         x = np.zeros(7)
         x[6] = offset
