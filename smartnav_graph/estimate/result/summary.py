@@ -91,9 +91,7 @@ def summarise(
     tracks = track_account(problem.builders, pass_state)
     fit = chi2_of(solved, keyframes, tracks)
     chi2 = fit.per_dof()
-    images = (seen is not None and seen.used > 0) or (tracks is not None and tracks.in_force)
-    mode = "batch" if used else "visual-inertial odometry" if images else "dead-reckoning"
-    mode = POSITIONS_ONLY if problem.positions_only else mode
+    mode = _mode(problem, used, seen, tracks)
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused] + weight_text(pass_state)
@@ -135,6 +133,13 @@ def summarise(
         "versions": versions(),
     }
     return summary | dict(extra)
+
+
+def _mode(problem: Problem, used: Mapping[str, int], seen: Account | None, tracks: Account | None) -> str:
+    """What holds the position."""
+    images = (seen is not None and seen.used > 0) or (tracks is not None and tracks.in_force)
+    mode = "batch" if used else "visual-inertial odometry" if images else "dead-reckoning"
+    return POSITIONS_ONLY if problem.positions_only else mode
 
 
 def _session(session: Session) -> dict[str, Any]:
