@@ -94,7 +94,7 @@ class BarometerBuilder(Builder):
     """Adds the bias of every keyframe, and its height where samples are near.
 
     t_ns (n,), height (n,) m over nav zero but for the bias, scale m/hPa; bias_sigma m, of the bias at first;
-    least_sigma m, of the mean around a keyframe
+    least_sigma m, of the mean around a keyframe; causal : made for a replay
     """
 
     t_ns: NDArray[np.int64]
@@ -107,6 +107,7 @@ class BarometerBuilder(Builder):
     stage: int = 0
     lookahead_s: float = HALF_S
     least_sigma: float = 0.0
+    causal: bool = False
     _start: float = 0.0
     _means: PerWindow[tuple[float, float, float] | None] = field(default_factory=PerWindow)
 
@@ -160,8 +161,10 @@ def build(context: FactorContext) -> BarometerBuilder | None:
     if options.reference_hpa is not None:
         sigma = options.reference_sigma
     scale, noise = metres_a_hpa(float(stream.pressure_hpa[0])), context.calibration.barometer_noise
-    least_sigma = scale * scatter_hpa(stream, noise)
-    return BarometerBuilder(stream.t_ns, height, scale, sigma, noise, options.loss, least_sigma=least_sigma)
+    least = 0.0 if context.causal else scale * scatter_hpa(stream, noise)  # a replay does not know what comes later
+    return BarometerBuilder(
+        stream.t_ns, height, scale, sigma, noise, options.loss, least_sigma=least, causal=context.causal
+    )
 
 
 def scatter_hpa(stream: Barometer, noise: BarometerNoise) -> float:

@@ -48,6 +48,7 @@ LINEAR_S, CLEAR = 0.025, 2.0
 LEAST_BORESIGHT_SIGMA = float(np.radians(0.25))
 SHOWN = 0.2  # of its prior sigma: that of a boresight that the turns show
 TABLE_S = 0.01  # step of the integrated rates
+LEAST_NOISE = 1e-5  # of a match, normalised: less is no camera
 MOST_BLOCKS = 8  # parts of the recording that the offset is found in
 
 
@@ -113,7 +114,7 @@ def compare_with_gyro(
     row_s : time (s) from the first row of an image to the middle one, where rows have their own time
     """
     turns, body_R_cam = _Turns(imu, np.zeros(3)), np.array(mount.body_R, dtype=np.float64)
-    problem = _Problem.of(pairs, turns, body_R_cam, camera.noise, camera.time_offset_s + row_s)
+    problem = _Problem.of(pairs, turns, body_R_cam, max(camera.noise, LEAST_NOISE), camera.time_offset_s + row_s)
     if problem is None:
         return None
     offsets = np.arange(-SEARCH_S, SEARCH_S + 0.5 * SEARCH_STEP_S, SEARCH_STEP_S)
@@ -304,7 +305,8 @@ class _Problem(NamedTuple):
         J = np.concatenate([missed.by_rotation @ by, missed.by_translation @ across.transpose(0, 2, 1)], axis=2) / sigma
         weighted = (J * weight[..., None]).transpose(0, 2, 1)
         H, g = weighted @ J, (weighted @ white[..., None])[..., 0]
-        inner = np.linalg.inv(H[:, 7:, 7:] + 1e-9 * np.eye(2))
+        own = H[:, 7:, 7:]
+        inner = np.linalg.inv(own + 1e-9 * (1.0 + np.trace(own, axis1=1, axis2=2))[:, None, None] * np.eye(2))
         carried = H[:, :7, 7:] @ inner
         normal = H[:, :7, :7] - carried @ H[:, 7:, :7]
         right = g[:, :7] - (carried @ g[:, 7:, None])[:, :, 0]

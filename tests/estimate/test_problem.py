@@ -119,8 +119,9 @@ def test_withheld_rows_are_kept_apart(eight):
 
 
 def test_without_inertial_data(eight):
+    assert prepare(eight.replace(imu=None), Config()).positions_only
     with pytest.raises(SessionError, match="imu"):
-        prepare(eight.replace(imu=None), Config())
+        prepare(eight.replace(imu=None, gnss=None), Config())
 
 
 def test_pictures_that_nobody_matched_are_told():

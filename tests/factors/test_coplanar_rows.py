@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.factors.coplanar_rows import COLUMNS, CompressedRows, PairRows, Rig, relative
+from smartnav_graph.factors.coplanar_rows import BASELINE_FLOOR_M, COLUMNS, CompressedRows, PairRows, Rig, relative
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.pairs import Pairs
 
@@ -78,7 +78,7 @@ def test_relative_pose_has_exact_derivatives(rng, rig):
 def test_nothing_is_left_at_the_truth(rng, rig):
     pairs, states, data = scene(rng, rig)
     residual, jacobians = PairRows(pairs, rig, SIGMA, pairs.there, 2.0).linearize(states, data)
-    assert np.abs(residual).max() < 1e-9
+    assert np.abs(residual).max() < 1e-7
     assert all(jacobian[:, 6].any() == 0 for jacobian in jacobians)
     there = relative(rig, states, data)
     small = CompressedRows(pairs, rig, SIGMA, pairs.there, 1e6, there)
@@ -107,7 +107,7 @@ def test_a_row_says_what_all_of_its_matches_say(rng):
     for k in range(2):
         mask = use[k]
         x0, x1 = (np.asarray(pairs.padded(x))[k][mask] for x in (pairs.x0, pairs.x1))
-        found = sampson(R[k], t[k], x0, x1, 1e-3)
+        found = sampson(R[k], t[k], x0, x1, BASELINE_FLOOR_M)
         white = found.residual / SIGMA
         weight = 1 / (1 + white**2 / 4)
         J = np.concatenate([found.by_rotation, found.by_translation], axis=1) / SIGMA @ by[0][k]
@@ -209,7 +209,7 @@ def test_no_baseline_is_harmless(rng):
         CompressedRows(pairs, RIG, SIGMA, pairs.there, 1e6, there),
     ):
         residual, jacobians = rows.linearize(still, data)
-        assert np.abs(residual).max() < 1e-9 and all(np.isfinite(jacobian).all() for jacobian in jacobians)
+        assert np.abs(residual).max() < 1e-7 and all(np.isfinite(jacobian).all() for jacobian in jacobians)
 
 
 @pytest.fixture

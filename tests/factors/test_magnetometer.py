@@ -233,5 +233,5 @@ def test_wrong_options_are_named(changes):
 
 @pytest.mark.parametrize("changes", [{"sigma_ut": 0.0}, {"disturbance_ut": -1.0}, {"soft_iron": (1.0,) * 8}])
 def test_wrong_calibrations_are_refused(changes):
-    with pytest.raises(CalibrationError, match="finite numbers, sigmas > 0, the nine of soft_iron"):
+    with pytest.raises(CalibrationError, match=r"^calibration.toml: .* = .*; expected (>|9 finite)"):
         MagnetometerNoise(**changes)

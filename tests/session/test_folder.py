@@ -89,19 +89,18 @@ def test_every_stream_survives_alone(name, geodetic, optional, tmp_path):
     assert list(back.extra) == ["satellites", "hdop"]
 
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
+readings = st.floats(-1e4, 1e4)
+DAY_NS = 86_400 * 10**9
 
 
 @given(
-    t=st.lists(st.integers(-(2**63), 2**63 - 1), min_size=2, max_size=5, unique=True),
-    values=hnp.arrays(np.float64, (5, 6), elements=finite),
+    first=st.integers(-(2**61), 2**61),
+    steps=st.lists(st.integers(1, 29 * DAY_NS), min_size=1, max_size=4),
+    values=hnp.arrays(np.float64, (5, 6), elements=readings),
 )
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_every_bit_survives(t, values, tmp_path):
-    n = len(t)
-    stamps = np.array(sorted(t), dtype=np.int64)
-    if (np.diff(stamps.astype(object)) >= 2**63).any():
-        return  # a step beyond int64 is no recording
+def test_every_bit_survives(first, steps, values, tmp_path):
+    stamps, n = first + np.cumsum([0, *steps]), 1 + len(steps)
     imu = Imu(t_ns=stamps, gyro=values[:n, :3], accel=values[:n, 3:])
     save(Session(imu=imu), tmp_path / "s", force=True)
     back = load(tmp_path / "s").imu
@@ -294,7 +293,7 @@ def test_geodetic_without_origin(saved):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("colour = 1", ("unknown key colour", "some of calibration, clock, device")),
+        ("colour = 1", ("unknown key colour", "one of schema, device, clock")),
         ("schema = 99", ("schema = 99; expected 1", "import the log again")),
         ("gravity_m_s2 = 1.0", ("gravity_m_s2 = 1.0; expected 9.0 to 10.5 m/s^2; give SI units",)),
         ("gravity_m_s2 = -9.81", ("gravity_m_s2 = -9.81",)),
@@ -302,10 +301,10 @@ def test_geodetic_without_origin(saved):
         ('[device]\nforward = "up"', ("axis 'up'; expected one of +x, -x, +y, -y, +z, -z",)),
         ('[device]\nforward = "+z"\nup = "-z"', ("forward '+z' and up '-z'; expected two different axes",)),
         ('[device]\nvehicle = "ship"', ("vehicle = 'ship'; expected one of none, car, trolley, foot",)),
-        ('[device]\ncolour = "red"', ("colour", "the keys of the session format")),
+        ('[device]\ncolour = "red"', ("colour", "one of name, forward, up")),
         ("[origin]\nlat_deg = 95.0\nlon_deg = 0.0\nheight_m = 0.0", ("lat_deg 95.0", "latitude in [-90, 90]")),
-        ("[origin]\nlat_deg = 5.0", ("lon_deg", "the keys of the session format")),
-        ("[sensors.gnss]\nlever = [0.0, 0.0, 0.0]", ("lever", "the keys of the session format")),
+        ("[origin]\nlat_deg = 5.0", ("lon_deg", "is missing")),
+        ("[sensors.gnss]\nlever = [0.0, 0.0, 0.0]", ("lever", "one of body_t, body_R, frame")),
     ],
 )
 def test_bad_keys_and_values_of_session_toml(text, parts, tmp_path):

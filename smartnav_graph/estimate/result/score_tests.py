@@ -89,7 +89,8 @@ class Unmodelled(NamedTuple):
         left = np.linalg.solve(np.eye(len(own)) + prior @ self.found.information[np.ix_(own, own)], prior)
         middle = left @ self.found.score[own]
         change = self.change[:, :, own]
-        return np.asarray(change @ (left + np.outer(middle, middle)) @ change.transpose(0, 2, 1))
+        added = change @ (left + np.outer(middle, middle)) @ change.transpose(0, 2, 1)
+        return np.asarray(0.5 * (added + added.transpose(0, 2, 1)))
 
 
 def unmodelled(solved: SolvedProblem) -> Unmodelled | None:

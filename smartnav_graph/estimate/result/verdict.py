@@ -295,9 +295,9 @@ def _two_places(inputs: VerdictInputs) -> Iterator[Reason]:
     of the largest spread d their fourth moment is little more than d^4, three times that if normal."""
     for name, residuals in inputs.solved.fixes.items():
         for axes, what in ((slice(0, 2), "fixes"), (slice(2, 3), "heights of the fixes")):
-            r = residuals.residual[:, axes] - residuals.residual[:, axes].mean(axis=0)
-            if len(r) <= LEAST_PAIRS:
+            if len(residuals.residual) <= LEAST_PAIRS:
                 continue
+            r = residuals.residual[:, axes] - residuals.residual[:, axes].mean(axis=0)
             along = r @ np.linalg.eigh(r.T @ r)[1][:, -1]
             apart = 2.0 * float(along.std())
             if apart > LEAST_APART_M and np.mean(along**4) < TWO_PLACES * np.mean(along**2) ** 2:

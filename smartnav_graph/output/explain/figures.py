@@ -108,7 +108,8 @@ class Explanation:
         return np.asarray(np.sqrt(self.keyframe.without[:, part] ** 2 @ variance / variance.sum()))
 
     def sigma(self, quantity: Quantity) -> float:
-        """Sigma of a quantity in its unit: of several components the root of the sum of squares."""
+        """Sigma of a quantity in its unit: of several components the root of the sum of squares. Without the errors of
+        sensors that are no states, which no measurement explains."""
         return float(np.linalg.norm(self.keyframe.sigma[quantity.components])) * quantity.factor
 
     def half_within_s(self, quantity: Quantity) -> float:

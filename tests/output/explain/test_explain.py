@@ -40,7 +40,8 @@ def test_without_a_time_the_least_certain_epoch_is_explained(stored):
     horizontal = np.hypot(*stored.solution.sigmas[:, 3:5].T)
     t_s = stored.solution.seconds[horizontal.argmax()]
     assert sentence_of(found, "Largest position").startswith(f"Largest position uncertainty of the run: at {t_s:.2f} s")
-    assert f"position {horizontal.max():.3f} m horizontal" in sentence_of(found, "1 sigma")
+    (sigma,) = re.findall(r"position ([0-9.]+) m horizontal", sentence_of(found, "1 sigma"))
+    assert float(sigma) == pytest.approx(horizontal.max(), rel=0.01)  # less errors of sensors that are no states
 
 
 def test_a_time_is_explained_by_the_nearest_keyframe(stored):
