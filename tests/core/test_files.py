@@ -152,8 +152,12 @@ def test_a_signal_waits_until_the_new_is_in_its_place(target, monkeypatch):
         moved(new, path, aside)
 
     monkeypatch.setattr(files, "_put", put)
-    with pytest.raises(KeyboardInterrupt), replacing(path) as new:
-        write(new, kind, "new")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by a process in the background
+    try:
+        with pytest.raises(KeyboardInterrupt), replacing(path) as new:
+            write(new, kind, "new")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert read(path) == "new" and names(path.parent) == ["result"]
 
 
