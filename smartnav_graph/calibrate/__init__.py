@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from smartnav_graph import readers
 from smartnav_graph.calibrate.result import CalibrationResult
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import replacing
@@ -134,6 +133,8 @@ def calibrate_into(
     CalibrationError
         The recordings do not support the calibration, or the file has this piece already, or is no calibration.toml.
     """
+    from smartnav_graph import readers
+
     row, known = KINDS[kind], Calibration()
     if out.exists():
         known = load_calibration(out)

@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph import readers
 from smartnav_graph.calibrate.board import Board, find_corners, size_shown, squares_differ
 from smartnav_graph.calibrate.camera_charts import camera_charts
 from smartnav_graph.calibrate.circles import without_eccentricity
@@ -35,6 +34,10 @@ MOST_NAMES = 8  # listed
 LOOKED_AT = 5  # pictures in which the size of the board is looked for
 CELLS = (8, 6)  # of the picture, in which corners are counted
 UNCERTAIN_PX = 2.0  # sigma of a projection, px, from which the report warns
+
+
+# What pictures of a board determine of a camera.
+INTERIOR = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +98,8 @@ def _files(sources: Sequence[Path], camera: str) -> list[tuple[str, Path]]:
         elif here and not (source / "session.toml").exists():
             found += [(path.name, path) for path in here]
         else:
+            from smartnav_graph import readers
+
             seen = pictures(readers.load(source))
             mine = [picture for picture in seen if picture.camera == camera]
             if not mine:
@@ -228,13 +233,12 @@ def _left_out(pictures: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _change(found: CameraFit, name: str) -> Callable[[Calibration], Calibration]:
-    """Puts the camera into a calibration; clock, readout and the noise of matches of an earlier one stay."""
+    """Puts the camera into a calibration; what is not its interior orientation stays as an earlier one has it."""
 
     def change(calibration: Calibration) -> Calibration:
         camera, before = found.camera, calibration.cameras.get(name)
         if before is not None:
-            kept = ("noise_px", "time_offset_s", "readout_s", "boresight_sigma_deg", "time_offset_sigma_s")
-            camera = replace(camera, **{key: getattr(before, key) for key in kept})
+            camera = replace(before, **{key: getattr(camera, key) for key in INTERIOR})
         return replace(calibration, cameras={**calibration.cameras, name: camera})
 
     return change

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from smartnav_graph.calibrate.interior import CameraFit
-from smartnav_graph.calibrate.projection import ImageMap, distortion, projection_difference
+from smartnav_graph.calibrate.projection import ImageMap, distortion
 from smartnav_graph.calibrate.result import Chart, Series
 from smartnav_graph.session.calibration.camera import Camera
 
@@ -61,16 +61,6 @@ def uncertainty_chart(found: CameraFit, sigma: ImageMap) -> Chart:
     note = f"From {least:.3f} to {most:.2f} px; a rotation of the camera is taken out."
     title = "Sigma of a projection, far points"
     return Chart(title, X, Y, lines, aspect=found.width / found.height, note=note)
-
-
-def difference_chart(one: Camera, other: Camera) -> Chart:
-    """Contours of the displacement between two calibrations."""
-    xy, apart, _ = projection_difference(one, other)
-    x, y = np.unique(xy[:, 0]), np.unique(xy[:, 1])
-    size = np.linalg.norm(apart, axis=1).reshape(len(y), len(x))
-    lines = [_frame(one.width, one.height), *_contours(ImageMap(x, y, size))]
-    note = f"Median {np.nanmedian(size):.3f} px, largest {np.nanmax(size):.2f} px; the best rotation is taken out."
-    return Chart("Difference of projections", X, Y, lines, aspect=one.width / one.height, note=note)
 
 
 def _contours(of: ImageMap) -> Iterator[Series]:

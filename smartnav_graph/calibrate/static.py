@@ -31,7 +31,6 @@ from smartnav_graph.session.streams import Imu
 LEAST_REST_S = 60.0
 LEAST_RANGE_C = 2.0  # of temperature for a regression
 NOISE_ROWS = 100  # the standard deviation is that about means over about half as many readings
-NOISE_ROWS = 100  # the standard deviation is that about means over about half as many readings
 SMOOTHED_S = 60.0  # over which readings of temperature are averaged
 NAMES = dict(zip(TERMS, ("white_noise", "bias_instability", "random_walk", "quantisation"), strict=True))
 UNITS = {

@@ -144,7 +144,7 @@ def align_to_gyro(
         value = tried_state.readout_s if optional == "readout" else tried_state.drift
         if abs(value) > SIGNIFICANT * tried.sigma(optional):
             state, solved = tried_state, tried
-    blocks, block_sigma = _oftime_blocks(problem, solved)
+    blocks, block_sigma = _offset_of_blocks(problem, solved)
     blocks[:, 1] += state.offset_s + state.drift * (blocks[:, 0] - problem.middle)
     return GyroAlignment(
         *(state.offset_s, state.drift, state.body_R_cam, state.bias, state.readout_s, solved.terms, solved.covariance),
@@ -311,7 +311,7 @@ def _tangent(t: Floats) -> Floats:
     return np.stack([a, np.cross(t, a)], axis=-1)
 
 
-def _oftime_blocks(problem: TurnProblem, solved: _Solved) -> tuple[Floats, Floats]:
+def _offset_of_blocks(problem: TurnProblem, solved: _Solved) -> tuple[Floats, Floats]:
     """Middle and correction of the offset (k, 2) s of each block, the other terms held; its sigma (k,)."""
     where, found, sigmas = term_slices(solved.terms)["offset"], [], []
     for rows, A, g in zip(problem.blocks, solved.information, solved.scores, strict=True):

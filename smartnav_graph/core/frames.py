@@ -75,12 +75,7 @@ class LocalFrame:
 
     def nav_from_ecef(self, ecef: ArrayLike) -> Floats:
         """ENU metres (n, 3) of Earth-centred Earth-fixed metres (n, 3)."""
-        import pyproj
-
-        rows = np.asarray(ecef, dtype=np.float64).reshape(-1, 3)
-        to_lla = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979")
-        lat, lon, height = to_lla.transform(rows[:, 0], rows[:, 1], rows[:, 2])
-        return self.nav_from_lla(np.stack([lat, lon, height], axis=-1))
+        return self.nav_from_lla(lla_from_ecef(ecef))
 
     @property
     def nav_R_ecef(self) -> Floats:
@@ -88,6 +83,14 @@ class LocalFrame:
         lat, lon = np.radians([self.origin.lat_deg, self.origin.lon_deg])
         sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
         return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
+
+
+def lla_from_ecef(ecef: ArrayLike) -> Floats:
+    """Geodetic rows (n, 3): lat deg, lon deg, height m, of Earth-centred Earth-fixed metres (n, 3)."""
+    import pyproj
+
+    rows = np.asarray(ecef, dtype=np.float64).reshape(-1, 3)
+    return np.stack(pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979").transform(*rows.T), axis=-1)
 
 
 def normal_gravity(lat_deg: float, height_m: float) -> float:

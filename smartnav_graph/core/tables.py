@@ -65,7 +65,7 @@ def _table(kind: type[Kind], table: object, key: str, where: str | Path) -> Kind
     for name, spec in specs.items():
         if name not in table and spec.default is spec.default_factory is dataclasses.MISSING:
             raise _BrokenRule(key, table, "a value: it has no default", f"key {_path(key, name)} is missing")
-    values: dict[str, object] = {}
+    values, hints = dict[str, object](), get_type_hints(kind)
     for name, spec in specs.items():
         if name not in table:
             continue
@@ -73,7 +73,7 @@ def _table(kind: type[Kind], table: object, key: str, where: str | Path) -> Kind
         if isinstance(value, float) and math.isnan(value) and (spec.metadata.get("nan") or default != default):
             values[name] = value
             continue
-        values[name] = _value(get_type_hints(kind)[name], value, _path(key, name), where)
+        values[name] = _value(hints[name], value, _path(key, name), where)
         positive = isinstance(default, int | float) and not isinstance(default, bool) and default > 0
         if positive and isinstance(value, int | float) and value < 0:
             raise _BrokenRule(_path(key, name), value, "a number >= 0")

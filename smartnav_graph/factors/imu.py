@@ -148,6 +148,11 @@ class ImuBuilder(Builder):
         """See `Builder`: noise and scale factors are estimated."""
         return self.config.estimate_noise or self.config.scale_sigma > 0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether more is known of the device than its class: by a calibration, or by scale factors as states."""
+        return self.weight != CLASS_WEIGHT or self.config.scale_sigma > 0
+
     def sampling_scales(self) -> dict[str, float]:
         """The noise between samples over that of `noise`, of accelerometer and gyroscope."""
         accel, gyro = self.sampling_noise
@@ -183,8 +188,7 @@ class ImuBuilder(Builder):
 
         sigma^2 T = (density^2 T) + (share |turn|)^2, for a device of which no more than its class is known, in replay.
         """
-        known = self.weight != CLASS_WEIGHT or self.config.scale_sigma > 0
-        if not pass_state.causal or known or window.kind == "gap" or not self.config.scale_error_share:
+        if not pass_state.causal or self.is_known or window.kind == "gap" or not self.config.scale_error_share:
             return pass_state
         turn = float(np.linalg.norm(window.dt @ (window.gyro - bias.gyroscope())))
         own = self.noise.gyro_noise_density * np.sqrt(window.length_s)

@@ -47,10 +47,10 @@ class LoggedFixes:
     fix_type: Times | None = None
     above_sea: bool = False
 
-    @property
-    def mounts(self) -> dict[str, Mount]:
-        """Frame of the stream ``gnss`` as the session has it."""
-        return {"gnss": Mount(frame="msl")} if self.above_sea else {}
+    def mounts(self, table: Table) -> dict[str, Mount]:
+        """Frame of the stream ``gnss`` as the session has it, by its columns: none where no height is known."""
+        known = self.above_sea and np.isfinite(np.asarray(table["height_m"], dtype=np.float64)).any()
+        return {"gnss": Mount(frame="msl")} if known else {}
 
 
 def unmarked(values: Floats | None, rows: int) -> Floats:

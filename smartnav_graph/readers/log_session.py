@@ -88,7 +88,7 @@ class LogParts:
         counts |= skipped or {}
         if len(table["t_ns"]):
             self.add("gnss", file, table, counts)
-            self.mounts = fixes.mounts if np.isfinite(table["height_m"]).any() else {}
+            self.mounts = fixes.mounts(table)
         else:
             self.count("gnss", counts)
 

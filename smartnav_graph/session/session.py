@@ -68,10 +68,10 @@ class Mount:
         if t.shape != (3,) or not (np.abs(t) <= FARTHEST_M).all():
             expected = f"three numbers of at most {FARTHEST_M:g} m"
             raise SessionError("session.toml [sensors]", f"body_t = {list(self.body_t)}", expected, "give metres")
-        if R.shape != (3, 3) or not np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_ERROR or np.linalg.det(R) < 0:
+        off = np.inf if R.shape != (3, 3) or np.linalg.det(R) < 0 else float(np.abs(R @ R.T - np.eye(3)).max())
+        if not off <= ROTATION_ERROR:
             found, rule = f"body_R = {R.tolist()}", f"the rows of a rotation, to {ROTATION_ERROR:g}"
             raise SessionError("session.toml [sensors]", found, rule, "give the axes of the sensor in body axes")
-        off = float(np.abs(R @ R.T - np.eye(3)).max())
         if off > ROUNDING:
             _LOG.warning("session.toml [sensors]: body_R is a rotation to %.1e only; the nearest rotation is used", off)
             u, _, vt = np.linalg.svd(R)
@@ -81,6 +81,9 @@ class Mount:
     def above_sea(self) -> bool:
         """Whether heights are above mean sea level."""
         return self.frame == "msl"
+
+
+_AT_ORIGIN = Mount()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +207,7 @@ class Session(Streams):
     def mount(self, sensor: str) -> Mount:
         """Where `sensor` is mounted; the body origin where the session does not give it. Axes of a camera that were
         calibrated take precedence."""
-        found = self.sensors.get(sensor, Mount())
+        found = self.sensors.get(sensor, _AT_ORIGIN)
         camera = None if self.calibration is None else self.calibration.cameras.get(sensor)
         if camera is None or not camera.body_R:
             return found
@@ -231,5 +234,6 @@ class Session(Streams):
                     row=row,
                     stream=stream.NAME,
                 )
-        arms = [self.mount(name or stream.NAME).body_t for name in names]
-        return np.array(arms, dtype=np.float64).reshape(-1, 3)
+        where = [name or stream.NAME for name in names]
+        arms = {name: self.mount(name).body_t for name in set(where)}
+        return np.array([arms[name] for name in where], dtype=np.float64).reshape(-1, 3)

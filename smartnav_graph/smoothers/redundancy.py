@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Indices
+from smartnav_graph.graph.update import FactorId
 from smartnav_graph.smoothers.estimate import Estimate
 
 # Source of the priors of the session's states (clock offsets, lever arms, mounts).
@@ -63,14 +64,17 @@ def redundancies(estimate: Estimate) -> Mapping[str, Redundancy]:
 
 def factor_fits(estimate: Estimate) -> FactorFits:
     """The fit of every factor in use, in the order of the graph."""
-    sensors, rows = [tag.sensor for tag, _ in estimate.factors], [tag.row for tag, _ in estimate.factors]
-    priors = sum(not state.held for state in estimate.session.values())
-    sensors += [CALIBRATION] * priors
-    rows += [-1] * priors
-    for stack in estimate.all_stacks:
-        used = stack.rows[stack.used]
-        sensors += [stack.sensor] * len(used)
-        rows += used.tolist()
-    marginals = estimate.marginals
+    names, marginals = factor_ids(estimate), estimate.marginals
+    rows = np.array([name.row for name in names], dtype=np.intp)
     first = np.cumsum(marginals.counts) - marginals.counts
-    return FactorFits(sensors, np.array(rows, dtype=np.intp), first, marginals.residual, marginals.fitted)
+    return FactorFits([name.sensor for name in names], rows, first, marginals.residual, marginals.fitted)
+
+
+def factor_ids(estimate: Estimate) -> list[FactorId]:
+    """Every factor in use, in the order of the graph."""
+    names = [name for name, _ in estimate.factors]
+    names += [FactorId(CALIBRATION, 0)] * sum(not state.held for state in estimate.session.values())
+    for stack in estimate.all_stacks:
+        pairs = zip(stack.t_ns[stack.used].tolist(), stack.rows[stack.used].tolist(), strict=True)
+        names += [FactorId(stack.sensor, t_ns, row) for t_ns, row in pairs]
+    return names

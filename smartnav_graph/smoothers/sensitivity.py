@@ -20,13 +20,13 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from smartnav_graph.core.arrays import Floats, Indices
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, dims_of, key, kind_of
 from smartnav_graph.graph.update import FactorId
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.redundancy import CALIBRATION
+from smartnav_graph.smoothers.redundancy import factor_ids
 from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 # First row and derivatives (m,) of the residuals of some factors.
@@ -71,30 +71,30 @@ class LinearSystem:
             for state in estimate.session.values()
             if not state.held
         ]
-        graph = WholeGraph([*(factor for _, factor in estimate.factors), *priors], estimate.blocks, estimate.held)
-        self._names = [name for name, _ in estimate.factors] + [FactorId(CALIBRATION, 0)] * len(priors)
-        for stack in graph.stacks:
-            pairs = zip(stack.t_ns[stack.used].tolist(), stack.rows[stack.used].tolist(), strict=True)
-            self._names += [FactorId(stack.sensor, t_ns, row) for t_ns, row in pairs]
-        self._linear, self._estimate = graph.linearize(estimate.values), estimate
+        native = WholeGraph([*(factor for _, factor in estimate.factors), *priors], (), estimate.held)
+        self._linear, self._estimate = native.linearize(estimate.values), estimate
+        for stack in estimate.all_stacks:
+            stack.add_to(self._linear, estimate.snapshot)
 
     def parts(self, sensors: Collection[str]) -> list[LinearPart]:
         """The factors of some sensors."""
-        found, row = list[LinearPart](), 0
-        for i, name in enumerate(self._names):
-            factor = self._linear.at(i)
+        counts, found = self._estimate.marginals.counts, list[LinearPart]()
+        first = (np.cumsum(counts) - counts).tolist()
+        for i, name in enumerate(factor_ids(self._estimate)):
+            factor = self._linear.at(i) if name.sensor in sensors else None
             if factor is None or factor.empty():
                 continue
-            A, right = factor.jacobian()
-            if name.sensor in sensors:
-                at, by_state = 0, dict[int, Floats]()
-                for state in factor.keys():  # noqa: SIM118
-                    width = kind_of(state).dim
-                    by_state[state] = A[:, at : at + width]
-                    at += width
-                found.append(LinearPart(name, row, by_state))
-            row += len(right)
+            states = list(factor.keys())
+            ends = np.cumsum(dims_of(np.array(states, dtype=np.uint64)))[:-1]
+            by_state = dict(zip(states, np.split(factor.jacobian()[0], ends, axis=1), strict=True))
+            found.append(LinearPart(name, first[i], by_state))
         return found
+
+    def at_poses(self, sensor: str) -> list[tuple[LinearPart, Floats, int]]:
+        """Factors of a sensor on one pose: derivatives (m, 3) by its position, body axes, and row of its keyframe."""
+        place = {index: k for k, index in enumerate(self._estimate.indices)}
+        poses = [(part, part.pose()) for part in self.parts([sensor])]
+        return [(part, pose[1], place[pose[0]]) for part, pose in poses if pose is not None]
 
     @cached_property
     def _matrices(self) -> tuple[csc_array, Floats]:
@@ -102,15 +102,20 @@ class LinearSystem:
         whole = csc_array((value, (i.astype(np.intp) - 1, j.astype(np.intp) - 1)))
         return whole[:, :-1], whole[:, [-1]].toarray()[:, 0]
 
+    @cached_property
+    def _normal(self) -> SuperLU:
+        """The normal equations, factorised."""
+        A, _ = self._matrices
+        return splu((A.T @ A).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
     def sensitivity(self, errors: Sequence[Derivatives]) -> Sensitivity:
         """Of errors that these derivatives of the residuals have."""
-        A, b = self._matrices
+        (A, b), normal = self._matrices, self._normal
         rows = [np.arange(first, first + len(by)) for error in errors for first, by in error]
         columns = np.repeat(np.arange(len(errors)), [sum(len(by) for _, by in error) for error in errors])
         values = [by for error in errors for _, by in error]
         J = csc_array((np.concatenate(values), (np.concatenate(rows), columns)), shape=(len(b), len(errors)))
         cross = (A.T @ J).toarray()
-        normal = splu((A.T @ A).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         fitted = normal.solve(np.column_stack([cross, A.T @ b]))
         information = (J.T @ J).toarray() - cross.T @ fitted[:, :-1]
         score = J.T @ b - cross.T @ fitted[:, -1]

@@ -162,8 +162,8 @@ def _comparison(problem: _Problem, found: _Rotations, x: Floats, bias: Floats, s
     spread = float(np.sqrt(np.average(own**2, weights=weight)))
     drift, formal = 0.0, float(np.sqrt(covariance[6, 6]))
     if len(parts) > 2:
-        (slope, _), root = np.polyfit(at, own, 1, w=np.sqrt(weight)), np.sqrt(weight)
-        left = own - np.polyval(np.polyfit(at, own, 1, w=root), at)
+        line = np.polyfit(at, own, 1, w=np.sqrt(weight))
+        slope, left = line[0], own - np.polyval(line, at)
         middle = np.average(at, weights=weight)
         sigma = np.sqrt((weight * left**2).sum() / (len(parts) - 2) / (weight * (at - middle) ** 2).sum())
         drift = float(slope * (at[-1] - at[0])) if abs(slope) > 3.0 * sigma else 0.0

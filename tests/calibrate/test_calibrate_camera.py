@@ -1,5 +1,6 @@
 """Camera calibration from pictures: which are used, what is refused, the recording of OpenCV."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -51,6 +52,10 @@ def test_calibration_file_holds_the_camera(chessboard, tmp_path):
     assert (camera.width, camera.height, camera.model) == (640, 480, "brown")
     assert camera.fx == result.values["back_fx"].value and piece.sources == ("chess",)
     assert len(result.charts) == 6 and {chart.title for chart in result.charts} >= {"Radial distortion"}
+    known = load_calibration(out)
+    turned = replace(camera, body_R=(0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0), time_offset_s=0.04)
+    again = result.change(replace(known, cameras={"back": turned})).cameras["back"]
+    assert again == turned  # pictures of a board say nothing of axes and clock
 
 
 def test_pictures_without_the_board_are_left_out_by_name(chessboard, tmp_path):

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.so3 import chained, exp
+from smartnav_graph.core.so3 import chained, exp, rotate
 from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.factors.coplanarity import LEAST_MATCHES, TURN_DRIFT, TURN_SIGMA, CoplanarityBuilder
 from smartnav_graph.session.calibration.model import ImuNoise
@@ -77,7 +77,7 @@ class _Curve:
         dt, rate = np.diff(self.t, prepend=0.0)[:, None], imu.gyro[rows] - gyro_bias
         rate = np.concatenate([rate[:1], 0.5 * (rate[1:] + rate[:-1])])  # up to each sample
         self.R, self.turn = chained(rate * dt).as_matrix(), np.cumsum(rate * dt, axis=0)
-        self.force = np.einsum("nij,nj->ni", self.R, imu.accel[rows])
+        self.force = rotate(self.R, imu.accel[rows])
         both = np.concatenate([self.force, self.R.reshape(-1, 9)], axis=1)
         once = np.cumsum(both * dt, axis=0)
         self.integrals = np.cumsum((once - 0.5 * both * dt) * dt, axis=0)
@@ -114,7 +114,7 @@ def _fitted(builder: CoplanarityBuilder, pairs: Pairs, curve: _Curve, prior: _Pr
     C, lever, sigma = builder.camera_model.body_R_cam, builder.rig.body_t_cam, builder.sigma
     back = C.T @ R0.transpose(0, 2, 1)
     R = back @ R1 @ C
-    fixed = np.einsum("nij,nj->ni", back, A1 - A0 + (R1 - R0) @ lever)
+    fixed = rotate(back, A1 - A0 + (R1 - R0) @ lever)
     time, square = ((t[:, None, None] * np.eye(3)) for t in (t1 - t0, 0.5 * (t1**2 - t0**2)))
     by = back @ np.concatenate([time, square, -(B1 - B0)], axis=2)
     gated = gate(pairs, R, np.hypot(sigma, TURN_SIGMA + TURN_DRIFT * pairs.length_s))
@@ -126,7 +126,7 @@ def _fitted(builder: CoplanarityBuilder, pairs: Pairs, curve: _Curve, prior: _Pr
         t = fixed + by @ x
         scale = weight / DIRECTION_SIGMA / (np.linalg.norm(t, axis=1) if k else 1.0)
         J = (across @ by) * scale[:, None, None]
-        white = np.einsum("nij,nj->ni", across, t) * scale[:, None]
+        white = rotate(across, t) * scale[:, None]
         robust = 1.0 / (1.0 + (white**2).sum(axis=1) / LOSS_SCALE**2) if k > 1 else np.ones(len(t))
         x = x + _step(J, white, robust[:, None] * np.ones(3), prior.normal(x))[0]
     for _ in range(ROUNDS):

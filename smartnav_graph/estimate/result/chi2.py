@@ -103,6 +103,6 @@ def _expected(solved: SolvedProblem, name: str) -> float:
     stacks = solved.estimate.stacks(name)
     if not stacks:
         return 1.0
-    dims = [stack.linearize(solved.estimate.values)[0].shape[1] for stack in stacks]
+    dims = [stack.linearize(solved.estimate.snapshot)[0].shape[1] for stack in stacks]
     expected = [expected_weighted_square(stack.loss, dim) for stack, dim in zip(stacks, dims, strict=True)]
     return float(np.average(expected, weights=[len(stack.keys) for stack in stacks]))

@@ -18,6 +18,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.estimate.reweight.outliers import position_builders
+from smartnav_graph.session.detect.scatter import apart_from_before
 from smartnav_graph.smoothers.redundancy import factor_fits
 
 # Neighbours on each side and degree of the polynomials.
@@ -57,7 +58,7 @@ def left_out(solved: SolvedProblem, least: int) -> Iterator[LeftOut]:
         order = order[np.argsort(solved.estimate.t_ns[found.keyframe[order]], kind="stable")]
         position = builder.position[found.rows[order], :2]
         t = (solved.estimate.t_ns[found.keyframe[order]] - solved.estimate.t_ns[0]) / NS
-        new = np.concatenate([[True], (np.diff(t) > 0) & np.diff(position, axis=0).any(axis=1)])[: len(t)]
+        new = apart_from_before(t, position)
         order, position, t = order[new], position[new], t[new]
         redundancy = 1.0 - fits.of(builder.name, found.rows[order], 3)[:, :2]
         error = found.residual[order, :2] / np.maximum(redundancy, LEAST_REDUNDANCY)

@@ -24,15 +24,14 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.frames import STANDARD_GRAVITY
-from smartnav_graph.core.so3 import log
+from smartnav_graph.core.so3 import log, rotate_back
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.result.assemble import SolvedProblem
 from smartnav_graph.factors.coplanar_rows import CompressedRows
-from smartnav_graph.factors.imu import CLASS_WEIGHT, ImuBuilder
+from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.states import key
 from smartnav_graph.graph.update import one_of
 from smartnav_graph.smoothers.sensitivity import Derivatives, LinearPart, LinearSystem, Sensitivity
-from smartnav_graph.smoothers.whole_graph import Snapshot
 
 # Parts of the fixes between which a clock may jump, and the least number of fixes that are tested.
 PARTS, LEAST_FIXES = 10, 6
@@ -74,11 +73,13 @@ class SensorError:
 
 
 class Unmodelled(NamedTuple):
-    """Errors without a state, what the data say of them, and the change (n, 15, k) of the keyframes by each."""
+    """Errors without a state, what the data say of them, the change (n, 15, k) of the keyframes by each, and the linear
+    system that shows it."""
 
     errors: Sequence[SensorError]
     found: Sensitivity
     change: Floats
+    linear: LinearSystem
 
     def covariance(self) -> Floats:
         """What they add to the covariance (n, 15, 15) of the keyframes."""
@@ -96,13 +97,13 @@ class Unmodelled(NamedTuple):
 def unmodelled(solved: SolvedProblem) -> Unmodelled | None:
     """Every error that is looked at; None where there is none."""
     linear = LinearSystem(solved.estimate)
-    parts = linear.parts({*solved.fixes, "imu", "static", PAIRS})
-    found = [*_of_positions(solved, parts), *_of_inertial_data(solved, parts), *_of_images(solved, parts)]
+    parts = linear.parts({"imu", "static", PAIRS})
+    found = [*_of_positions(solved, linear), *_of_inertial_data(solved, parts), *_of_images(solved, parts)]
     found += _of_stances(solved, parts)
     if not found:
         return None
     sensitivity = linear.sensitivity([rows for _, rows in found])
-    return Unmodelled([error for error, _ in found], sensitivity, linear.keyframes(sensitivity.change))
+    return Unmodelled([error for error, _ in found], sensitivity, linear.keyframes(sensitivity.change), linear)
 
 
 def sensor_errors(looked_at: Unmodelled | None) -> list[SensorError]:
@@ -122,13 +123,11 @@ def sensor_errors(looked_at: Unmodelled | None) -> list[SensorError]:
     return errors
 
 
-def _of_positions(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
+def _of_positions(solved: SolvedProblem, linear: LinearSystem) -> Iterator[tuple[SensorError, Derivatives]]:
     estimate = solved.estimate
     R, _, v, _ = estimate.states()
-    place = {index: k for k, index in enumerate(estimate.indices)}
     for sensor in solved.fixes:
-        poses = [(part, part.pose()) for part in parts if part.name.sensor == sensor]
-        rows = [(part, pose[1], place[pose[0]]) for part, pose in poses if pose is not None]
+        rows = linear.at_poses(sensor)
         if len(rows) < LEAST_FIXES:
             continue
         moved = [(part.row, W @ R[k].T @ v[k]) for part, W, k in rows]
@@ -159,13 +158,12 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Ite
         return
     R, _, v, _ = estimate.states()
     on_foot = solved.problem.rests is not None and solved.problem.rests.on_foot
-    known = imu.weight != CLASS_WEIGHT or imu.config.scale_sigma > 0
-    scale_sigma, sensitivity_sigma = (0.0, 0.0) if known else (SCALE_SIGMA, G_SENSITIVITY_SIGMA)
+    scale_sigma, sensitivity_sigma = (0.0, 0.0) if imu.is_known else (SCALE_SIGMA, G_SENSITIVITY_SIGMA)
     first = np.array([k for _, _, k in rows])
     length_s = np.diff(estimate.t_ns)[first, None] / NS
     turned = log(R[first].transpose(0, 2, 1) @ R[first + 1]) / length_s
     accel = (v[first + 1] - v[first]) / length_s + [0.0, 0.0, solved.problem.session.gravity]
-    force = np.einsum("nji,nj->ni", 0.5 * (R[first] + R[first + 1]), accel)
+    force = rotate_back(0.5 * (R[first] + R[first + 1]), accel)
     force -= force.mean(axis=0)
 
     def directions(bias: int, reading: Floats) -> Derivatives:
@@ -178,9 +176,7 @@ def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Ite
     for kind, reading, density, bias in kinds:
         varies = (np.var(reading, axis=0) > EXCITED * density**2 * float(np.mean(1.0 / length_s))) & (not on_foot)
         for axis in range(3):
-            error = SensorError(
-                "imu", kind, "xyz"[axis], prior_sigma=scale_sigma, shows=bool(varies[axis]) and not on_foot
-            )
+            error = SensorError("imu", kind, "xyz"[axis], prior_sigma=scale_sigma, shows=bool(varies[axis]))
             yield error, directions(bias + axis, reading[:, axis])
     for gyro in range(3):
         for axis in range(3):
@@ -220,7 +216,7 @@ def _of_images(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[t
         moved = copy(stack.model)
         moved.root = stack.model.root.copy()
         moved.root[:, :, :9] *= np.outer(across, across).ravel()
-        states = stack.states(Snapshot(solved.estimate.values, solved.estimate.held))
+        states = stack.states(solved.estimate.snapshot)
         change = [model.linearize(states, stack.data)[0] for model in (moved, stack.model)]
         derivative = (change[0] - change[1]) / FOCAL_STEP
         rows += [(by_pair[row], derivative[k]) for k, row in enumerate(stack.rows.tolist()) if row in by_pair]

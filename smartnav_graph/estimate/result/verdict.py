@@ -212,7 +212,10 @@ def _filtered(inputs: VerdictInputs) -> Iterator[Reason]:
 def _lasting(inputs: VerdictInputs) -> Iterator[Reason]:
     """Errors that last, of fixes whose sigmas or calibration say that they have none."""
     builders, pass_state = inputs.solved.problem.builders, inputs.solved.pass_state
-    silent = lasting_errors(builders, inputs.solved.estimate, pass_state) if inputs.together else frozenset[str]()
+    silent = frozenset[str]()
+    if inputs.together:
+        linear = None if inputs.unmodelled is None else inputs.unmodelled.linear
+        silent = lasting_errors(builders, inputs.solved.estimate, pass_state, linear)
     for builder in position_builders(builders):
         sigma = float(np.median(builder.scaled_sigma(pass_state)[:, :2]))
         joined = builder.has_sigmas and builder.name in pass_state.correlated and sigma < CARRIER_PHASE_SIGMA

@@ -23,7 +23,7 @@ from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.smoothers.estimate import Estimate
-from smartnav_graph.smoothers.sensitivity import LinearPart, LinearSystem, Sensitivity
+from smartnav_graph.smoothers.sensitivity import LinearSystem, Sensitivity
 
 # Errors that are looked for: amplitude in units of the stated sigmas, and correlation time, s.
 LASTING = ((1.0, 10.0), (2.0, 20.0))
@@ -33,8 +33,11 @@ EVIDENCE = 0.0
 LEAST_FIXES, MOST_FIXES, LEAST_SIGMA = 30, 120, 0.1
 
 
-def lasting_errors(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> frozenset[str]:
-    """Sensors whose fixes have errors that last, and neither a state for them nor sigmas found by the run."""
+def lasting_errors(
+    builders: Iterable[Builder], estimate: Estimate, pass_state: PassState, linear: LinearSystem | None = None
+) -> frozenset[str]:
+    """Sensors whose fixes have errors that last, and neither a state for them nor sigmas found by the run; linear : the
+    system of the estimate, where it is there already."""
     asked = [
         builder
         for builder in position_builders(builders)
@@ -45,26 +48,22 @@ def lasting_errors(builders: Iterable[Builder], estimate: Estimate, pass_state: 
     ]
     if not asked:
         return frozenset()
-    linear = LinearSystem(estimate)
-    parts = linear.parts([builder.name for builder in asked])
-    return frozenset(b.name for b in asked if _evidence(b, linear, parts, estimate, pass_state) > EVIDENCE)
+    linear = linear or LinearSystem(estimate)
+    return frozenset(b.name for b in asked if _evidence(b, linear, estimate, pass_state) > EVIDENCE)
 
 
-def _evidence(
-    builder: PositionBuilder, linear: LinearSystem, parts: list[LinearPart], estimate: Estimate, pass_state: PassState
-) -> float:
+def _evidence(builder: PositionBuilder, linear: LinearSystem, estimate: Estimate, pass_state: PassState) -> float:
     """Largest logarithm of the Bayes factors of `LASTING`, horizontal errors and those of heights that count."""
-    poses = [(part, part.pose()) for part in parts if part.name.sensor == builder.name]
-    rows = [(part, *pose) for part, pose in poses if pose is not None][:MOST_FIXES]
+    rows = linear.at_poses(builder.name)[:MOST_FIXES]
     if len(rows) < LEAST_FIXES:
         return -np.inf
-    place, R = {index: k for k, index in enumerate(estimate.indices)}, estimate.states()[0]
+    R = estimate.states()[0]
     sigma = builder.scaled_sigma(pass_state)[[part.name.row for part, _, _ in rows]]
     axes = 3 if builder.measures_height.all() else 2
     errors = [
-        [(part.row, (by @ R[place[index]].T)[:, axis] * sigma[k, axis])]
+        [(part.row, (by @ R[row].T)[:, axis] * sigma[k, axis])]
         for axis in range(axes)
-        for k, (part, index, by) in enumerate(rows)
+        for k, (part, by, row) in enumerate(rows)
     ]
     found = linear.sensitivity(errors)
     t = np.array([part.name.t_ns - rows[0][0].name.t_ns for part, _, _ in rows]) / NS

@@ -132,10 +132,11 @@ def _update_noise_and_fixes(
     new, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
     if new.rejected != pass_state.rejected:
         return new, False
+    settled = calm and change < STEADY
+    if not (settled or (new.stage < LAST_STAGE and change < CLOSE)):
+        return new, False
     grown = enable_second_stage(builders, estimate, new)
-    if grown.stage > new.stage and change < CLOSE:
-        return grown, False
-    return (grown, grown == new) if calm and change < STEADY else (new, False)
+    return (grown, grown == new) if settled or grown.stage > new.stage else (new, False)
 
 
 def suspects(builder: PositionBuilder, rejected: frozenset[int]) -> frozenset[int]:
@@ -204,8 +205,8 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
-    lasting = lasting_errors(builders, estimate, replace(pass_state, correlated=pass_state.correlated | correlated))
-    correlated |= {builder.name for builder in positions if builder.name in lasting and builder.noise.is_correlated}
+    may_last = [builder for builder in positions if builder.noise.is_correlated]
+    correlated |= lasting_errors(may_last, estimate, replace(pass_state, correlated=pass_state.correlated | correlated))
     blind = {
         state.name: state.prior_mean
         for state in estimate.session.values()

@@ -23,7 +23,7 @@ from smartnav_graph.graph.update import FactorId
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.redundancy import CALIBRATION
-from smartnav_graph.smoothers.whole_graph import StackedFactors
+from smartnav_graph.smoothers.whole_graph import Snapshot, StackedFactors
 
 Names = NDArray[np.uint64]
 
@@ -72,7 +72,7 @@ class Influence:
         kind = np.array([kinds[i] for i in estimate.indices], dtype=object)
         keyframes = Keyframes(index, estimate.t_ns, kind, estimate.states()[0])
         sensors = sorted({block.sensor for block in estimate.blocks})
-        stacks = [_of_stack(stack, estimate.values) for sensor in sensors for stack in estimate.stacks(sensor)]
+        stacks = [_of_stack(stack, estimate.snapshot) for sensor in sensors for stack in estimate.stacks(sensor)]
         found = [*_native(estimate), *stacks, *_priors(estimate)]
         return cls([group for group in found if len(group.t_ns)], keyframes)
 
@@ -140,9 +140,9 @@ def _group(sensor: str, tags: Sequence[FactorId], keys: Sequence[Sequence[int]],
     return Group(sensor, t_ns, row, np.array(keys, dtype=np.uint64), augmented)
 
 
-def _of_stack(stack: StackedFactors, values: gtsam.Values) -> Group:
+def _of_stack(stack: StackedFactors, snapshot: Snapshot) -> Group:
     """The used rows of a stack under their loss, without fixed states."""
-    residual, jacobians = stack.linearize(values)
+    residual, jacobians = stack.linearize(snapshot)
     free = [i for i, name in enumerate(stack.keys[0]) if name not in stack.held]
     rows = np.concatenate([*(jacobians[i] for i in free), -residual[:, :, None]], axis=2)
     rows *= np.sqrt(stack.weight(residual))[:, None, None]

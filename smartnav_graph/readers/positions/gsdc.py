@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from smartnav_graph.core.frames import lla_from_ecef
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.positions.track import session_of_fixes
@@ -31,17 +32,13 @@ def _matches(source: str) -> bool:
 
 
 def _read(source: str, repairs: tuple[str, ...]) -> Session:
-    import pyproj
-
     path = Path(source)
     table = read_text(path, whole=True)
     table = table.rows(table.known(STAMP))
     t_ns, every = np.unique(table.times(STAMP, NS // 1000), return_index=True)
     ecef = table.floats(*PLACE)[every]
-    to_lla = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     known = np.isfinite(ecef).all(axis=1)
-    x, y, z = ecef[known].T
-    lon, lat, height = to_lla.transform(x, y, z)
+    lat, lon, height = lla_from_ecef(ecef[known]).T
     unused = {"epochs without a position": int((~known).sum())}
     return session_of_fixes(path, LoggedFixes(t_ns[known], lat, lon, height), "unix", repairs, unused)
 

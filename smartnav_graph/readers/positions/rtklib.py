@@ -14,6 +14,7 @@ import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import lla_from_ecef
 from smartnav_graph.core.timebase import NS, ns_from_texts
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.positions.track import session_of_fixes
@@ -85,11 +86,7 @@ def _places(path: Path, cells: dict[str, Floats]) -> Floats:
     rows = np.stack([cells[name] for name in _PLACES[kind]], axis=1)
     if kind == "lla":
         return rows
-    import pyproj
-
-    to_lla = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-    lon, lat, height = to_lla.transform(rows[:, 0], rows[:, 1], rows[:, 2])
-    return np.stack([lat, lon, height], axis=1)
+    return lla_from_ecef(rows)
 
 
 def _times(path: Path, stamps: list[tuple[str, str]], system: str) -> Times:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.readers.fixes import LoggedFixes, first_fix, fix_table
 from smartnav_graph.readers.source import build_session
@@ -26,7 +24,7 @@ def session_of_fixes(
     if not len(table["t_ns"]):
         found = f"holds no position in {len(fixes.t_ns)} rows"
         raise SessionError(path, found, "at least one fix", "record again with a view of the sky", stream="gnss")
-    mounts = fixes.mounts if np.isfinite(table["height_m"]).any() else {}
+    mounts = fixes.mounts(table)
     session = build_session(
         {"gnss": (path, table)}, repairs, clock_epoch=epoch, origin=first_fix(table), sensors=mounts
     )

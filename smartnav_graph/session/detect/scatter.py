@@ -72,13 +72,18 @@ def normalised_residuals(t_ns: Times, position: Floats, spacing: int = 1) -> Flo
     return out
 
 
+def apart_from_before(t: Floats | Times, position: Floats) -> Mask:
+    """Rows (n,) that are later than the row before, and elsewhere."""
+    return np.concatenate([[True], (np.diff(t) > 0) & np.diff(position, axis=0).any(axis=1)])[: len(t)]
+
+
 def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatter | None:
     """Scatter of fixes (n, d), m; None where there are too few. Rows with the same stamp or position as the row before
     are one fix. `unit` (n,) or (n, d) m: the scatter in units of these sigmas."""
     units = np.broadcast_to(1.0 if unit is None else np.atleast_2d(np.asarray(unit).T).T, position.shape)
     used = np.isfinite(position).all(axis=1) & np.isfinite(units).all(axis=1)
     t_ns, position, units = t_ns[used], position[used], units[used]
-    new = np.concatenate([[True], (np.diff(t_ns) > 0) & np.diff(position, axis=0).any(axis=1)])[: len(t_ns)]
+    new = apart_from_before(t_ns, position)
     t_ns, position, units = t_ns[new], position[new], units[new]
     if len(t_ns) < LEAST_FIXES:
         return None
