@@ -34,3 +34,18 @@ prepare_environment() {
     .venv/bin/python -m pip install --quiet --use-pep517 --disable-pip-version-check -c constraints.txt -e ".$extras"
     if [ -n "$extras" ]; then echo "$stamp" > .venv/installed-test; else echo "$stamp" > .venv/installed; fi
 }
+
+# prepare_browser: CHROMIUM is the program of a Chromium or Chrome; Debian's is installed where there is none
+prepare_browser() {
+    local name sudo=""
+    if [ -x "${CHROMIUM:-}" ]; then return; fi
+    for name in chromium chromium-browser google-chrome google-chrome-stable; do
+        if CHROMIUM=$(command -v "$name"); then export CHROMIUM; return; fi
+    done
+    if [ "$(id -u)" != 0 ]; then sudo="sudo -n"; fi
+    if { $sudo apt-get update -qq && $sudo apt-get install -qq -y --no-install-recommends chromium; } >/dev/null 2>&1; then
+        CHROMIUM=$(command -v chromium); export CHROMIUM; return
+    fi
+    echo "The tests of the report need a Chromium: install one (Debian: apt install chromium), or name its program in CHROMIUM." >&2
+    return 1
+}
