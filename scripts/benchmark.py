@@ -178,14 +178,14 @@ def measure_front_end(folder: Path) -> None:
 
 def measure_allan() -> None:
     """The readings of the baseline."""
-    from bare_allan import RATE_HZ, readings
+    from bare_allan import readings
 
     from smartnav_graph.calibrate.allan import allan_deviation, cluster_sizes
 
     rows = readings()
     sizes = cluster_sizes(len(rows))
     begin = time.process_time()
-    found = allan_deviation(rows, 1 / RATE_HZ, sizes)
+    found = allan_deviation(rows, sizes)
     print_result(time.process_time() - begin, {"cluster_times": len(sizes), "sum": float(found.sum())})
 
 

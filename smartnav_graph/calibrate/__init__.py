@@ -96,6 +96,12 @@ KINDS: dict[str, CalibrationKind] = {
         "rate and jitter of samples; offset and drift between two clocks",
         "smartnav calibrate clock session --claimed-hz 100 --out calibration.toml",
     ),
+    "axes": CalibrationKind(
+        "axes",
+        "AxesOptions",
+        "permutation, signs and small angles of a device's axes, by a reference IMU or known turns",
+        "smartnav calibrate axes phone reference --out calibration.toml",
+    ),
     "static": CalibrationKind(
         "static",
         "StaticOptions",

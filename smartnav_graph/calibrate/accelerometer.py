@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -90,13 +89,12 @@ def lengths(parameters: Floats, means: Floats) -> Floats:
     return np.asarray(np.linalg.norm((means - parameters[:3]) @ matrix_of(parameters).T, axis=1))
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: AccelerometerOptions) -> CalibrationResult:
     """Calibrate the accelerometer by the rests of one recording."""
-    session, chosen = one_session(sources), options if isinstance(options, AccelerometerOptions) else None
-    chosen = chosen or AccelerometerOptions()
+    session = one_session(sources)
     warnings = check_readings(session, ("accel",))
-    rests = find_rests(session.require_imu(), chosen.least_rest_s)
-    fitted = fit_rests(session, rests, chosen.parameters)
+    rests = find_rests(session.require_imu(), options.least_rest_s)
+    fitted = fit_rests(session, rests, options.parameters)
     return result_of(fitted, session.gravity, warnings)
 
 

@@ -25,10 +25,10 @@ def cluster_sizes(count: int) -> Indices:
     return np.unique(np.round(np.logspace(0, np.log10(last), int(PER_DECADE * np.log10(last)) + 2)).astype(np.intp))
 
 
-def allan_deviation(readings: Floats, dt: float, sizes: Indices) -> Floats:
-    """Overlapping Allan deviation (k, c), in the unit of the readings, at tau = sizes (k,) dt.
+def allan_deviation(readings: Floats, sizes: Indices) -> Floats:
+    """Overlapping Allan deviation (k, c), in the unit of the readings, at tau = sizes (k,) times the interval.
 
-    readings : (n, c), every `dt` s; c axes, each in a thread of its own
+    readings : (n, c) at even intervals; c axes, each in a thread of its own
     """
     with ThreadPoolExecutor() as pool:
         return np.stack(list(pool.map(lambda column: _one_axis(column, sizes), readings.T)), axis=1)

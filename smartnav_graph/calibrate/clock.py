@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -70,7 +69,7 @@ def sample_numbers(t_ns: Times) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.maximum(np.round(steps / np.median(steps)), 1.0))])
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: ClockOptions) -> CalibrationResult:
     """Rate and jitter of the inertial samples of one recording, offset and drift of the arrivals of fixes.
 
     Raises
@@ -78,7 +77,7 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     CalibrationError
         Fewer than 60 inertial samples.
     """
-    session, chosen = one_session(sources), options if isinstance(options, ClockOptions) else ClockOptions()
+    session = one_session(sources)
     imu, values, refused, warnings = session.require_imu(), {}, {}, []
     if len(imu) < LEAST_PAIRS:
         found = f"{len(imu)} inertial samples"
@@ -92,9 +91,9 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     values["imu_samples_lost"] = Value(float(numbers[-1] + 1 - len(imu)), 0.0, "1")
     charts = [_chart("Stamps of the inertial samples less an even clock", "Sample", line)]
     residuals = {"imu": Residual(float(line.residuals.std()), len(line.residuals), "s")}
-    if chosen.claimed_hz is not None:
-        share = values["imu_rate"].value / chosen.claimed_hz - 1
-        values["imu_rate_error"] = Value(share, values["imu_rate"].sigma / chosen.claimed_hz, "1")
+    if options.claimed_hz is not None:
+        share = values["imu_rate"].value / options.claimed_hz - 1
+        values["imu_rate_error"] = Value(share, values["imu_rate"].sigma / options.claimed_hz, "1")
         if abs(share) > 0.01:
             warnings.append(f"imu: {100 * share:+.2f} % against the claimed rate; check the stamps of the log")
     if line.left_out:

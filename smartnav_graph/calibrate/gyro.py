@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -72,7 +71,7 @@ def accelerated_by(session: Session, rests: list[RestRows], accel: Accelerometer
                    matrix: Floats) -> Callable[[Floats], Floats]:  # fmt: skip
     """Misfits of the turns as a function of the parameters of the accelerometer."""
     weight = LEAST_MISFIT / np.radians(options.turn_sigma_deg)
-    axes = _level(np.array([turn.after for turn in turns_between(session, rests, accel, options)]))
+    axes = so3.across(np.array([turn.after for turn in turns_between(session, rests, accel, options)]))
 
     def by(parameters: Floats) -> Floats:
         other = replace(accel, found=replace(accel.found, parameters=parameters))
@@ -117,18 +116,13 @@ def attitudes_after(turns: list[Turn], matrix: Floats) -> Floats:
     return np.asarray(product[:, 0])
 
 
-def _level(up: Floats) -> Floats:
-    """Two unit vectors across each direction (m, 3): (m, 2, 3)."""
-    return np.asarray(np.linalg.svd(up[:, None, :])[2][:, 1:])
-
-
 def misfits(turns: list[Turn], matrix: Floats, known_weight: float, axes: Floats | None = None) -> Floats:
     """Direction of gravity after each turn by the gyro, across that by the accelerometer (2 m,); then errors of known
     angles, weighted."""
     attitude = attitudes_after(turns, matrix)
     by_gyro = so3.rotate_back(attitude, np.array([turn.before for turn in turns]))
     after = np.array([turn.after for turn in turns])
-    left = np.einsum("nij,nj->ni", _level(after) if axes is None else axes, by_gyro - after).ravel()
+    left = np.einsum("nji,nj->ni", so3.across(after) if axes is None else axes, by_gyro - after).ravel()
     angles = [
         (np.linalg.norm(turn.dt @ turn.rates @ matrix.T) - turn.known) * known_weight for turn in turns if turn.known
     ]
@@ -172,10 +166,10 @@ def left_out_misfit(turns: list[Turn], options: GyroOptions) -> float:
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: GyroOptions) -> CalibrationResult:
     """Calibrate the gyro by the turns between the rests of one recording."""
-    session, chosen = one_session(sources), options if isinstance(options, GyroOptions) else GyroOptions()
-    return fit_both(session, chosen)[1]
+    session = one_session(sources)
+    return fit_both(session, options)[1]
 
 
 def fit_both(session: Session, options: GyroOptions) -> tuple[CalibrationResult, CalibrationResult]:

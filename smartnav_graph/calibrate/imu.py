@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from smartnav_graph.calibrate.gyro import GyroOptions, fit_both
 from smartnav_graph.calibrate.result import CalibrationResult
@@ -12,10 +11,9 @@ from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Session
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: GyroOptions) -> CalibrationResult:
     """Calibrate both by one recording."""
-    chosen = options if isinstance(options, GyroOptions) else GyroOptions()
-    accel, gyro = fit_both(one_session(sources), chosen)
+    accel, gyro = fit_both(one_session(sources), options)
     both = (("accel", accel), ("gyro", gyro))
 
     def change(known: Calibration) -> Calibration:

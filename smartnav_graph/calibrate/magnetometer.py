@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from smartnav_graph.calibrate.static import one_session
 from smartnav_graph.core import so3
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
+from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.calibration.pieces import Residual, Value
 from smartnav_graph.session.session import Session
@@ -71,7 +71,7 @@ def sphere(readings: Floats) -> tuple[Floats, float]:
     return middle + found[:3], float(np.sqrt(max(found[3] + found[:3] @ found[:3], 1e-12)))
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: MagnetometerOptions) -> CalibrationResult:
     """Calibrate the magnetometer of one recording.
 
     Raises
@@ -79,13 +79,13 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     CalibrationError
         No magnetometer, a constant axis, or readings in a plane.
     """
-    session, chosen = one_session(sources), options if isinstance(options, MagnetometerOptions) else None
+    session = one_session(sources)
     where, stream = str(session.path or "session"), session.magnetometer
     if stream is None or len(stream) < 50:
         raise CalibrationError(where, "has no magnetometer, or few readings", "at least 50", "turn it about all axes")
     readings = stream.field_ut[:: max(len(stream) // MOST_ROWS, 1)]
     _check(where, readings)
-    known = chosen.strength_ut if chosen is not None else None
+    known = options.strength_ut
     if known is None and session.magnetic_field_ut is not None:
         known = float(np.linalg.norm(session.magnetic_field_ut))
     centre, radius = sphere(readings)
@@ -213,7 +213,7 @@ def _turn(
     if imu is None or stream is None:
         refused["turn"] = "no accelerometer; record it with the magnetometer"
         return np.eye(3)
-    force = np.stack([np.interp(stream.t_ns, imu.t_ns, column) for column in imu.accel.T], axis=1)
+    force = interpolate(stream.t_ns, imu.t_ns, imu.accel)
     lengths = np.linalg.norm(force, axis=1)
     still = np.abs(lengths / session.gravity - 1) < STILL
     rows = np.flatnonzero(still)[:: max(int(still.sum()) // MOST_ROWS, 1)]

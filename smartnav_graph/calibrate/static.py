@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.fft import dct
@@ -20,9 +19,10 @@ from smartnav_graph.calibrate.noise import TERMS
 from smartnav_graph.calibrate.rests import RestRows, check_readings, find_rests, interval_s
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
 from smartnav_graph.calibrate.static_axis import MEANS, AxisAtRest, block_means, characterise
+from smartnav_graph.core import so3
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.session.calibration.model import Calibration, ImuErrors, ImuNoise
 from smartnav_graph.session.calibration.pieces import Residual, Value
 from smartnav_graph.session.session import Session
@@ -57,7 +57,7 @@ class StaticOptions:
     """Shortest rest that is used, s."""
 
 
-def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> CalibrationResult:
+def fit(sources: Sequence[Session], options: StaticOptions) -> CalibrationResult:
     """Characterise the sensors of one recording at rest.
 
     Raises
@@ -65,11 +65,11 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     CalibrationError
         No rest that is long enough; constant or clipped axis; more than one recording.
     """
-    session, chosen = one_session(sources), options if isinstance(options, StaticOptions) else StaticOptions()
+    session = one_session(sources)
     warnings, imu = check_readings(session), session.require_imu()
-    rests, dt = find_rests(imu, chosen.least_rest_s, quiet=0.5), interval_s(imu.t_ns)
+    rests, dt = find_rests(imu, options.least_rest_s, quiet=0.5), interval_s(imu.t_ns)
     if not rests:
-        found = f"no rest of {chosen.least_rest_s:g} s: the device moved"
+        found = f"no rest of {options.least_rest_s:g} s: the device moved"
         raise CalibrationError(session.path or "session", found, "a device at rest", "put it on a firm table")
     warnings += _moved(session, rests)
     temperature, refused = _temperature(session, rests)
@@ -77,7 +77,7 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     beside = None if temperature is None else temperature - mean_c
     axes = {
         f"{sensor}_{'xyz'[i]}": characterise(
-            getattr(imu, sensor)[:, i], rests, beside, dt, chosen.highest_order, common=sensor == "gyro"
+            getattr(imu, sensor)[:, i], rests, beside, dt, options.highest_order, common=sensor == "gyro"
         )
         for sensor in ("accel", "gyro")
         for i in range(3)
@@ -105,7 +105,7 @@ def fit(sources: Sequence[Session] | Sequence[Path], options: object) -> Calibra
     return CalibrationResult(values, residuals, refused, tuple(warnings), change, tuple(charts))
 
 
-def one_session(sources: Sequence[Session] | Sequence[Path]) -> Session:
+def one_session(sources: Sequence[Session]) -> Session:
     """The only session of the sources.
 
     Raises
@@ -113,7 +113,7 @@ def one_session(sources: Sequence[Session] | Sequence[Path]) -> Session:
     CalibrationError
         There are several.
     """
-    if len(sources) != 1 or not isinstance(sources[0], Session):
+    if len(sources) != 1:
         raise CalibrationError("sources", f"{len(sources)} recordings", "one session", "calibrate one at a time")
     return sources[0]
 
@@ -144,7 +144,7 @@ def _temperature(session: Session, rests: list[RestRows]) -> tuple[Floats | None
     width = min(max(round(SMOOTHED_S / interval_s(stream.t_ns)), 1), len(stream))
     padded = np.pad(stream.temperature_c, (width // 2, width - 1 - width // 2), mode="edge")
     smooth = np.convolve(padded, np.full(width, 1 / width), mode="valid")
-    at = np.interp(imu.t_ns, stream.t_ns, smooth)
+    at = interpolate(imu.t_ns, stream.t_ns, smooth)
     span = float(np.ptp(np.concatenate([at[rest.rows] for rest in rests])))
     if span < LEAST_RANGE_C:
         return None, {"temperature": f"constant within {span:.2g} deg C; heat or cool the device"}
@@ -194,9 +194,9 @@ def _heading_noise(session: Session, rest: RestRows, values: dict[str, Value], r
     """Noise of heading, pitch and roll by magnetometer and accelerometer, each at its own rate."""
     imu, stream = session.require_imu(), session.magnetometer
     up = block_mean_direction(imu.accel[rest.rows])
-    across = np.linalg.svd(up[None])[2][1:]  # two level directions, (2, 3)
+    level = so3.across(up[None])[0]  # two directions, (3, 2)
     force = imu.accel[rest.rows]
-    tilt = np.degrees((force - force.mean(axis=0)) @ across.T / np.linalg.norm(force.mean(axis=0)))
+    tilt = np.degrees((force - force.mean(axis=0)) @ level / np.linalg.norm(force.mean(axis=0)))
     for i, name in enumerate(("tilt_noise_a", "tilt_noise_b")):
         values[name] = Value(float(tilt[:, i].std()), np.nan, "deg")
     if stream is None:
@@ -208,8 +208,8 @@ def _heading_noise(session: Session, rest: RestRows, values: dict[str, Value], r
         return
     for i, reading in enumerate(stream.field_ut[inside].T):
         values[f"magnetometer_noise_{'xyz'[i]}"] = Value(float(reading.std()), np.nan, "uT")
-    level = stream.field_ut[inside] @ across.T
-    heading = np.degrees(np.unwrap(np.arctan2(level[:, 1], level[:, 0])))
+    field = stream.field_ut[inside] @ level
+    heading = np.degrees(np.unwrap(np.arctan2(field[:, 1], field[:, 0])))
     count = len(heading)
     values["heading_noise"] = Value(float(heading.std()), float(heading.std() / np.sqrt(2 * count)), "deg")
 
@@ -262,7 +262,7 @@ def _allan_charts(
     for sensor in ("accel", "gyro"):
         unit = UNITS[sensor][0]
         left = [max(axes[f"{sensor}_{a}"].found.residuals, key=len) for a in "xyz"]
-        deviation = allan_deviation(np.stack(left, axis=1), dt, sizes)
+        deviation = allan_deviation(np.stack(left, axis=1), sizes)
         series = []
         for i, a in enumerate("xyz"):
             low, high = confidence_limits(deviation[:, i], sizes, len(rest))

@@ -33,7 +33,7 @@ from smartnav_graph.calibrate.turn_start import (
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.clustered import clustered_covariance
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.so3 import log
+from smartnav_graph.core.so3 import across, log
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.streams import Imu
@@ -205,7 +205,7 @@ def _solve(
         noise = 0.5 * (noise + max(1.4826 * float(np.median(np.abs(r[problem.there]))), 1e-6))
         weight = np.where(problem.there, 1.0 / (1.0 + (r / (CAUCHY * noise)) ** 2), 0.0)
         J = _derivatives(problem, state, terms, R, t, seen)
-        Jt = np.einsum("nkj,nja->nka", seen.by_translation, _tangent(t))
+        Jt = np.einsum("nkj,nja->nka", seen.by_translation, across(t))
         spread = [DIRECTION_SIGMA] * 2
         if state.readout_s > 0 and problem.rows:
             delay = state.readout_s * 0.5 * (problem.rows[0] + problem.rows[1])
@@ -301,14 +301,6 @@ def _directions(geometry: Geometry, noise: float, before: Floats | None) -> Floa
         weight = there / (1.0 + geometry.square(t) / (CAUCHY * noise) ** 2)
         t = geometry.fitted(weight / geometry.scale(t))
     return t
-
-
-def _tangent(t: Floats) -> Floats:
-    """Two unit vectors (n, 3, 2) across each direction (n, 3)."""
-    least = np.eye(3)[np.argmin(np.abs(t), axis=1)]
-    a = np.cross(t, least)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    return np.stack([a, np.cross(t, a)], axis=-1)
 
 
 def _offset_of_blocks(problem: TurnProblem, solved: _Solved) -> tuple[Floats, Floats]:

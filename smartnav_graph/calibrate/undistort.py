@@ -10,7 +10,7 @@ import numpy as np
 
 from smartnav_graph.calibrate.camera import SUFFIXES
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.files import refuse_existing
+from smartnav_graph.core.files import replacing
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.vision.images import BROKEN, RESIZED, Gray
 
@@ -46,7 +46,7 @@ def undistort_folder(folder: str | Path, camera: Camera, out: str | Path, *, for
     Raises
     ------
     SessionError
-        No pictures, or `out` has files already.
+        No pictures, or `out` exists: it is replaced with `force` only, and only where it holds such pictures.
     """
     import cv2
 
@@ -54,16 +54,20 @@ def undistort_folder(folder: str | Path, camera: Camera, out: str | Path, *, for
     files = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES) if source.is_dir() else []
     if not files:
         raise SessionError(source, "no pictures", f"files as {', '.join(SUFFIXES)}")
-    refuse_existing(target, force)
-    target.mkdir(parents=True, exist_ok=True)
+    others = [path.name for path in target.iterdir() if not path.name.startswith(PREFIX)] if target.is_dir() else []
+    if others:
+        found = f"holds {others[0]}, so it is not replaced"
+        raise SessionError(target, found, f"a new name, or a folder of {PREFIX} pictures", "choose another --out")
     left_out, written = {}, 0
-    for path in files:
-        picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if picture is None or picture.shape[:2] != (camera.height, camera.width):
-            left_out[path.name] = BROKEN if picture is None else RESIZED
-            continue
-        shown = undistorted(np.asarray(picture, dtype=np.uint8), camera)
-        if not cv2.imwrite(str(target / undistorted_name(path.name)), shown):
-            raise SessionError(target, f"{undistorted_name(path.name)} cannot be written", "a writable place")
-        written += 1
+    with replacing(target, force=force) as new:
+        new.mkdir()
+        for path in files:
+            picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            if picture is None or picture.shape[:2] != (camera.height, camera.width):
+                left_out[path.name] = BROKEN if picture is None else RESIZED
+                continue
+            shown = undistorted(np.asarray(picture, dtype=np.uint8), camera)
+            if not cv2.imwrite(str(new / undistorted_name(path.name)), shown):
+                raise SessionError(target, f"{undistorted_name(path.name)} cannot be written", "a writable place")
+            written += 1
     return Undistorted(written, left_out)

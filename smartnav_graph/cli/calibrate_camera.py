@@ -70,7 +70,7 @@ class Undistort(Command):
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("undistorted")
     """New folder."""
     force: Switch = False
-    """Write into a folder that has files."""
+    """Replace an older folder of such pictures."""
 
     def run(self) -> None:
         from smartnav_graph.calibrate.undistort import undistort_folder

@@ -105,6 +105,11 @@ def is_rotation(R: Floats, atol: float = 1e-6) -> bool:
     return bool(np.allclose(R @ R.T, np.eye(3), atol=atol) and np.linalg.det(R) > 0)
 
 
+def across(directions: Floats) -> Floats:
+    """Two unit vectors (m, 3, 2) perpendicular to each direction (m, 3) and to each other."""
+    return np.swapaxes(np.linalg.svd(directions[:, None, :])[2][:, 1:], 1, 2)
+
+
 def best_rotation(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """The rotation R (3, 3) that minimises sum |y - R x|^2 over points x, y (n, 3), each minus its mean.
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.so3 import chained, exp
+from smartnav_graph.core.so3 import across, chained, exp
 from smartnav_graph.core.timebase import seconds_since
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.health.facts import Finding
@@ -301,8 +301,7 @@ class _Problem(NamedTuple):
         white = missed.residual / sigma
         beyond = (white / LOSS_SCALE) ** 2  # Cauchy loss
         weight, cost = there / (1.0 + beyond), 0.5 * LOSS_SCALE**2 * np.log1p(beyond)
-        across = np.linalg.svd(t[:, None, :])[2][:, 1:]  # (n, 2, 3) perpendicular to t
-        J = np.concatenate([missed.by_rotation @ by, missed.by_translation @ across.transpose(0, 2, 1)], axis=2) / sigma
+        J = np.concatenate([missed.by_rotation @ by, missed.by_translation @ across(t)], axis=2) / sigma
         weighted = (J * weight[..., None]).transpose(0, 2, 1)
         H, g = weighted @ J, (weighted @ white[..., None])[..., 0]
         own = H[:, 7:, 7:]

@@ -33,7 +33,7 @@ def recorded(seed, lost=0, late=0, fixes=600):
 def covered(seeds):
     count = Coverage()
     for seed in seeds:
-        values = clock.fit([recorded(seed, late=12)], None).values
+        values = clock.fit([recorded(seed, late=12)], clock.ClockOptions()).values
         count.add("rate", values["imu_rate"], RATE)
         count.add("drift", values["clock_drift"], DRIFT)
         count.add("offset", values["clock_offset"], OFFSET)
@@ -62,7 +62,7 @@ def test_lost_samples_and_late_fixes_do_not_move_the_line():
 def test_a_rate_far_from_the_claimed_one_and_missing_pairs_are_named():
     result = clock.fit([recorded(2).replace(gnss=None)], clock.ClockOptions(claimed_hz=200.0))
     assert "-50.1" in result.warnings[0] and "arrival_ns" in result.refused["clock_drift"]
-    assert not clock.fit([recorded(2)], None).warnings
+    assert not clock.fit([recorded(2)], clock.ClockOptions()).warnings
     few = recorded(2)
     with pytest.raises(CalibrationError, match="50 inertial samples"):
-        clock.fit([few.replace(imu=few.imu.take(slice(0, 50)))], None)
+        clock.fit([few.replace(imu=few.imu.take(slice(0, 50)))], clock.ClockOptions())

@@ -20,7 +20,7 @@ ACCEL = np.array([[1.004, 0.003, -0.002], [0.0, 0.996, 0.004], [0.0, 0.0, 1.002]
 ACCEL_BIAS = np.array([0.3, -0.2, 0.1])
 GYRO = np.array([[1.01, 0.004, -0.003], [0.002, 0.99, 0.005], [-0.004, 0.001, 1.006]])
 GYRO_BIAS = np.array([0.01, -0.02, 0.005])
-OPTIONS = gyro.GyroOptions()
+OPTIONS, ACCEL_OPTIONS = gyro.GyroOptions(), accelerometer.AccelerometerOptions()
 
 
 def handled(seed, rests=24, accel_noise=0.03, gyro_noise=0.002):
@@ -87,7 +87,7 @@ def test_a_calibration_takes_the_errors_out():
 def test_cross_validation_keeps_the_smaller_model():
     found = accelerometer.fit([handled(2, rests=7)], accelerometer.AccelerometerOptions()).refused
     assert "accel_misalignment_xy" in found and "more attitudes" in found["accel_misalignment_xy"]
-    assert not accelerometer.fit([handled(2)], None).refused
+    assert not accelerometer.fit([handled(2)], ACCEL_OPTIONS).refused
 
 
 def changed(session, **columns):
@@ -97,9 +97,9 @@ def changed(session, **columns):
 def test_bad_recordings_are_named():
     good = handled(3)
     with pytest.raises(CalibrationError, match=r"rests in . attitudes; expected more than 3"):
-        accelerometer.fit([handled(3, rests=3)], None)
+        accelerometer.fit([handled(3, rests=3)], ACCEL_OPTIONS)
     with pytest.raises(CalibrationError, match=r"specific force at rest is .*import it in m/s"):
-        accelerometer.fit([changed(good, accel=good.imu.accel / G)], None)
+        accelerometer.fit([changed(good, accel=good.imu.accel / G)], ACCEL_OPTIONS)
     with pytest.raises(CalibrationError, match="look like deg/s"):
         gyro.fit([changed(good, gyro=np.degrees(good.imu.gyro))], OPTIONS)
     with pytest.raises(CalibrationError, match="all axes of the gyro read with the opposite sign"):
@@ -147,7 +147,7 @@ def test_known_turns_of_ferraris():
     [("android/calib_acc_Nexus5_d1", 0.0172, 0.0283), ("ios/calib_acc_iPhone5_d3", 0.0103, 0.020)],
 )
 def test_phones_held_in_hand(recording, after, left_out):
-    result = accelerometer.fit([sn.load(DATASETS / "phone_mocap_tyrex" / recording)], None)
+    result = accelerometer.fit([sn.load(DATASETS / "phone_mocap_tyrex" / recording)], ACCEL_OPTIONS)
     assert result.residuals["length"].rms <= after and result.residuals["length_left_out"].rms <= left_out
 
 

@@ -70,7 +70,7 @@ def test_a_calibration_gives_the_field_in_the_axes_of_the_device():
 def test_a_sphere_is_kept_where_an_ellipsoid_predicts_no_better():
     result = magnetometer.fit([turned_in_air(2, soft=np.eye(3))], OPTIONS)
     assert "is no better" in result.refused["soft_iron_xy"] and "soft_iron_xy" not in result.values
-    unknown = magnetometer.fit([turned_in_air(2)], None)
+    unknown = magnetometer.fit([turned_in_air(2)], magnetometer.MagnetometerOptions())
     assert "the place is not known" in unknown.refused["scale"]
 
 
@@ -89,6 +89,6 @@ def test_bad_recordings_are_named():
 @real("phone_mocap_tyrex")
 def test_the_field_of_a_phone_has_one_length():
     session = sn.load(DATASETS / "phone_mocap_tyrex" / "android" / "calib_mag_Nexus5_d1")
-    found = magnetometer.fit([session], None).residuals
+    found = magnetometer.fit([session], magnetometer.MagnetometerOptions()).residuals
     assert found["length"].rms < 0.5 * found["length_before"].rms
     assert found["length_left_out"].rms < 1.5

@@ -28,6 +28,7 @@ WALKING = {
 }
 SLOPE, ZERO_C = (2.0e-4, 0.85e-4, -6.1e-4), 40.0
 MAG = 0.5
+OPTIONS = static.StaticOptions()
 
 
 def at_rest(seed, terms=TERMS):
@@ -50,7 +51,7 @@ def covered(seeds):
     count = Coverage()
     for seed in seeds:
         kind = (TERMS, WALKING)[seed % 2]
-        values = static.fit([at_rest(seed, kind)], static.StaticOptions()).values
+        values = static.fit([at_rest(seed, kind)], OPTIONS).values
         for sensor, terms in kind.items():
             for i, axis in enumerate("xyz"):
                 names = {"white": "white_noise"}
@@ -83,7 +84,7 @@ def test_allan_deviation_of_the_numbers_of_nist():
     for _ in range(999):
         numbers.append(16807 * numbers[-1] % 2147483647)
     readings = np.array(numbers)[:, None] / 2147483647.0
-    found = allan_deviation(readings, 1.0, np.array([1, 10, 100]))[:, 0]
+    found = allan_deviation(readings, np.array([1, 10, 100]))[:, 0]
     assert np.allclose(found, [2.922319e-01, 9.159953e-02, 3.241343e-02], rtol=2e-7)
 
 
@@ -91,7 +92,7 @@ def test_allan_deviation_is_that_of_allantools():
     allantools = pytest.importorskip("allantools")
     readings = np.random.default_rng(0).standard_normal((30_000, 2)).cumsum(axis=0)
     sizes = cluster_sizes(len(readings))
-    found = allan_deviation(readings, 0.01, sizes)
+    found = allan_deviation(readings, sizes)
     for i in range(2):
         _, theirs, _, _ = allantools.oadev(readings[:, i], rate=100.0, data_type="freq", taus=sizes * 0.01)
         assert np.allclose(found[:, i], theirs, rtol=1e-9)
@@ -101,7 +102,7 @@ def test_confidence_limits_hold_the_expected_deviation():
     sizes, inside = np.array([1, 10, 100, 1000]), np.zeros(4)
     for seed in range(200):
         readings = np.random.default_rng(seed).standard_normal((10_000, 1))
-        low, high = confidence_limits(allan_deviation(readings, 1.0, sizes)[:, 0], sizes, len(readings))
+        low, high = confidence_limits(allan_deviation(readings, sizes)[:, 0], sizes, len(readings))
         truth = 1 / np.sqrt(sizes)
         inside += (low <= truth) & (truth <= high)
     assert (inside / 200 > 0.89).all() and (inside[:3] / 200 < 0.99).all()
@@ -109,7 +110,7 @@ def test_confidence_limits_hold_the_expected_deviation():
 
 def test_a_calibration_takes_out_the_bias_of_the_temperature():
     session = at_rest(3)
-    result = static.fit([session], static.StaticOptions())
+    result = static.fit([session], OPTIONS)
     errors = result.change(Calibration()).imu_errors
     left = errors.corrected(session.imu, session.temperature).gyro
     slow = left.reshape(-1, 600, 3).mean(axis=1).std(axis=0)
@@ -118,12 +119,12 @@ def test_a_calibration_takes_out_the_bias_of_the_temperature():
 
 
 def test_what_the_data_do_not_carry_is_refused():
-    result = static.fit([at_rest(1, {s: {"white": t["white"]} for s, t in TERMS.items()})], None)
+    result = static.fit([at_rest(1, {s: {"white": t["white"]} for s, t in TERMS.items()})], OPTIONS)
     assert {"gyro_random_walk_x", "gyro_bias_instability_y"} <= set(result.refused)
     assert "record longer" in result.refused["gyro_random_walk_x"]
     constant = at_rest(1)
     still = np.full(len(constant.temperature), 25.0)
-    found = static.fit([constant.replace(temperature=replace(constant.temperature, temperature_c=still))], None)
+    found = static.fit([constant.replace(temperature=replace(constant.temperature, temperature_c=still))], OPTIONS)
     assert "constant within 0 deg C" in found.refused["temperature"]
     assert not any("temperature" in name for name in found.values)
 
@@ -136,22 +137,23 @@ def test_bad_recordings_are_named():
     clean = at_rest(2)
     imu, rng = clean.imu, np.random.default_rng(0)
     with pytest.raises(CalibrationError, match="gyro_y is constant"):
-        static.fit([changed(clean, gyro=imu.gyro * [1, 0, 1])], None)
+        static.fit([changed(clean, gyro=imu.gyro * [1, 0, 1])], OPTIONS)
     with pytest.raises(CalibrationError, match="accel_z is clipped"):
-        static.fit([changed(clean, accel=np.minimum(imu.accel, [9, 9, 9.925]))], None)
+        static.fit([changed(clean, accel=np.minimum(imu.accel, [9, 9, 9.925]))], OPTIONS)
     moved = imu.accel + 3 * np.cumsum(rng.standard_normal((COUNT, 3)), axis=0) * np.sqrt(DT)
     with pytest.raises(CalibrationError, match="the device moved"):
-        static.fit([changed(clean, accel=moved)], None)
+        static.fit([changed(clean, accel=moved)], OPTIONS)
     step = 0.03
-    coarse = static.fit([changed(clean, accel=np.round(imu.accel / step) * step)], None)
+    coarse = static.fit([changed(clean, accel=np.round(imu.accel / step) * step)], OPTIONS)
     assert any("accel_x is quantised in steps of 0.03" in text for text in coarse.warnings)
     knocked = imu.accel.copy()
     knocked[30_000:33_000] += np.sin(np.arange(3000))[:, None]
-    assert "moved 5 %" in static.fit([changed(clean, accel=knocked)], None).warnings[0]
+    assert "moved 5 %" in static.fit([changed(clean, accel=knocked)], OPTIONS).warnings[0]
     smooth = np.apply_along_axis(lambda x: np.convolve(x, np.ones(8) / 8, "same"), 0, imu.gyro)
     smooth[:10], smooth[-10:] = smooth[10], smooth[-11]
     assert any(
-        "low-passed" in text and "gyro_x" in text for text in static.fit([changed(clean, gyro=smooth)], None).warnings
+        "low-passed" in text and "gyro_x" in text
+        for text in static.fit([changed(clean, gyro=smooth)], OPTIONS).warnings
     )
 
 
@@ -160,7 +162,7 @@ def test_six_hours_of_a_phone_at_rest():
     data = np.load(DATASETS / "static_galaxy_s5" / "samsung_galaxy_s5_static_10Hz.npz")
     t_ns = np.arange(len(data["acc_mps2"])) * 10**8
     imu = Imu(t_ns=t_ns, accel=data["acc_mps2"].astype(float), gyro=data["gyro_measured_radps"].astype(float))
-    result = static.fit([sn.Session(imu=imu)], None)
+    result = static.fit([sn.Session(imu=imu)], OPTIONS)
     least = [np.degrees(result.values[f"gyro_allan_minimum_{a}"].value) for a in "xyz"]
     taus = [result.values[f"gyro_allan_minimum_tau_{a}"].value for a in "xyz"]
     white = [np.degrees(result.values[f"gyro_white_noise_{a}"].value) for a in "xyz"]

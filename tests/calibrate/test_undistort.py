@@ -40,6 +40,10 @@ def test_folder_of_the_logger_of_2012(tmp_path):
     assert undistorted_name("a.png") == "ImageUndistorted_a.png"
     with pytest.raises(SessionError, match="exists already"):
         undistort_folder(tmp_path / "in", PHONE, tmp_path / "out")
+    assert undistort_folder(tmp_path / "in", PHONE, tmp_path / "out", force=True).written == 2
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    with pytest.raises(SessionError, match=r"holds notes\.txt, so it is not replaced"):
+        undistort_folder(tmp_path / "in", PHONE, tmp_path / "out", force=True)
 
 
 def test_commands(tmp_path, capsys):

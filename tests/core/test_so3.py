@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from smartnav_graph.core.so3 import (
+    across,
     exp,
     from_quaternion,
     left_jacobian_inverse,
@@ -26,6 +27,14 @@ axes = hnp.arrays(np.float64, (1, 3), elements=st.floats(-1.0, 1.0)).filter(lamb
 
 def rotation_vector(axis, angle):
     return angle * axis / np.linalg.norm(axis)
+
+
+@settings(deadline=None)
+@given(axes)
+def test_across_is_perpendicular(v):
+    both = across(v)[0]
+    np.testing.assert_allclose(both.T @ both, np.eye(2), atol=1e-14)
+    np.testing.assert_allclose(v @ both, 0.0, atol=1e-14 * np.abs(v).max())
 
 
 @settings(deadline=None)

@@ -19,6 +19,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.core.tables import structured
+from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.calibration.pieces import Piece
 from smartnav_graph.session.streams import Imu, Temperature
@@ -250,7 +251,7 @@ class ImuErrors:
         accel, gyro = (np.reshape(matrix, (3, 3)).T for matrix in (self.accel_matrix, self.gyro_matrix))
         accel_bias, gyro_bias = np.array(self.accel_bias), np.array(self.gyro_bias)
         if temperature is not None and len(temperature):
-            at_c = np.interp(imu.t_ns, temperature.t_ns, temperature.temperature_c)
+            at_c = interpolate(imu.t_ns, temperature.t_ns, temperature.temperature_c)
             accel_bias = accel_bias + self._by_temperature(self.accel_temperature, at_c)
             gyro_bias = gyro_bias + self._by_temperature(self.gyro_temperature, at_c)
         return dataclasses.replace(imu, accel=(imu.accel - accel_bias) @ accel, gyro=(imu.gyro - gyro_bias) @ gyro)
