@@ -58,6 +58,9 @@ class Import(Writing):
     shift: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE=S")] = ()
     """Seconds to add to the stamps of a file whose clock cannot be tied to that of the inertial log; repeatable."""
 
+    denoise: Annotated[Text, tyro.conf.arg(metavar="WAVELET:LEVEL")] = None
+    """Keep only the slow part of the inertial data, as db4:7 (Daubechies 4, level 7) of the 2016 study, which makes
+    positions worse. Needs PyWavelets."""
     columns: Annotated[Text, tyro.conf.arg(metavar="NAME|DESCRIPTION")] = None
     """Columns of a text file of no known format, such as "time=t_ms:ms, ax=accel_x:g, gx=gyro_x:deg/s ...", or the name
     of a description that was kept."""
@@ -67,14 +70,16 @@ class Import(Writing):
     def run(self) -> None:
         from smartnav_graph.readers.columns import parse_columns, save_profile
         from smartnav_graph.readers.join import join
+        from smartnav_graph.session.denoise import Denoising, denoised
         from smartnav_graph.session.folder import save
 
         check_session_out(self.out, self.force)
+        how = None if self.denoise is None else Denoising.parse(self.denoise)
         with progress(self.quiet) as show:
             show(f"reading {', '.join(self.source)}", 0, 0)
             columns = None if self.columns is None else parse_columns(self.columns)
             found = join(self.source, self.format, repairs(self.repair), assigned_seconds(self.shift), columns)
-            session, ties = found.session, found.ties
+            session, ties = found.session if how is None else denoised(found.session, how), found.ties
             save(session, self.out, force=self.force, progress=show)
         print("\n".join([session_text(session), *(f"clock: {tie}" for tie in ties)]))
         if self.columns is not None and self.save_columns is not None:
