@@ -43,12 +43,19 @@ the vertical, whatever the attitude.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
     from smartnav_graph.core.errors import SmartnavError as SmartnavError
+    from smartnav_graph.core.errors import SmartnavWarning as SmartnavWarning
+    from smartnav_graph.core.frames import Origin as Origin
+    from smartnav_graph.core.progress import Progress
     from smartnav_graph.estimate.config import Config as Config
+    from smartnav_graph.estimate.config import RunOptions
     from smartnav_graph.estimate.run import Run as Run
+    from smartnav_graph.evaluation import Evaluation as Evaluation
     from smartnav_graph.evaluation import evaluate as evaluate
     from smartnav_graph.graph.solution import Solution as Solution
     from smartnav_graph.output.run_folder import read_run as read_run
@@ -58,26 +65,48 @@ if TYPE_CHECKING:
     from smartnav_graph.readers.reference import load_reference as load_reference
     from smartnav_graph.session.calibration.model import Calibration as Calibration
     from smartnav_graph.session.folder import save as save
+    from smartnav_graph.session.session import Device as Device
+    from smartnav_graph.session.session import Mount as Mount
     from smartnav_graph.session.session import Session as Session
+    from smartnav_graph.session.streams import Barometer as Barometer
+    from smartnav_graph.session.streams import ControlPoint as ControlPoint
+    from smartnav_graph.session.streams import GnssFix as GnssFix
+    from smartnav_graph.session.streams import Images as Images
+    from smartnav_graph.session.streams import Imu as Imu
+    from smartnav_graph.session.streams import Magnetometer as Magnetometer
+    from smartnav_graph.session.streams import Matches as Matches
+    from smartnav_graph.session.streams import PoseFix as PoseFix
+    from smartnav_graph.session.streams import Ranges as Ranges
+    from smartnav_graph.session.streams import Reference as Reference
+    from smartnav_graph.session.streams import StaticPeriod as StaticPeriod
+    from smartnav_graph.session.streams import Temperature as Temperature
+    from smartnav_graph.session.streams import Tracks as Tracks
+    from smartnav_graph.session.streams import Velocity as Velocity
+    from smartnav_graph.session.streams import WheelSpeed as WheelSpeed
     from smartnav_graph.simulation.scenarios import simulate as simulate
 
-# name -> its module, imported at first use, so that the package itself loads fast
-_MODULES = {
-    "Calibration": "session.calibration.model",
-    "Config": "estimate.config",
-    "Run": "estimate.run",
-    "Session": "session.session",
-    "SmartnavError": "core.errors",
-    "Solution": "graph.solution",
-    "evaluate": "evaluation",
-    "join": "readers.join",
-    "load": "readers",
-    "load_reference": "readers.reference",
-    "read_run": "output.run_folder",
-    "save": "session.folder",
-    "simulate": "simulation.scenarios",
-    "write_run": "output.run_folder",
+# module -> its public names, imported at first use, so that the package itself loads fast
+_NAMES = {
+    "core.errors": ("SmartnavError", "SmartnavWarning"),
+    "core.frames": ("Origin",),
+    "estimate.config": ("Config",),
+    "estimate.run": ("Run",),
+    "evaluation": ("Evaluation", "evaluate"),
+    "graph.solution": ("Solution",),
+    "output.run_folder": ("read_run", "write_run"),
+    "readers": ("load",),
+    "readers.join": ("join",),
+    "readers.reference": ("load_reference",),
+    "session.calibration.model": ("Calibration",),
+    "session.folder": ("save",),
+    "session.session": ("Device", "Mount", "Session"),
+    "session.streams": (
+        *("Barometer", "ControlPoint", "GnssFix", "Images", "Imu", "Magnetometer", "Matches", "PoseFix", "Ranges"),
+        *("Reference", "StaticPeriod", "Temperature", "Tracks", "Velocity", "WheelSpeed"),
+    ),
+    "simulation.scenarios": ("simulate",),
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     *_MODULES,
@@ -86,24 +115,32 @@ __all__ = [
     "smooth",
 ]
 
+if not TYPE_CHECKING:  # a name that is not there is an error of a type checker, too
 
-def __getattr__(name: str) -> object:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    def __getattr__(name: str) -> object:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-def smooth(session: Session, config: Config | None = None, **options: Any) -> Solution:
+def smooth(
+    session: Session,
+    config: Config | None = None,
+    *,
+    progress: bool | Progress = False,
+    **options: Unpack[RunOptions],
+) -> Solution:
     """The smoothed solution of a recorded session: all states with covariance, from all data.
 
     Parameters
     ----------
-    session : of `load` or `simulate`
+    session : of `load`, `Session.from_pandas`, `Session.from_arrays` or `simulate`
     config : all options; the defaults suit phones and MEMS loggers
+    progress : True shows the stage on stderr, also in a notebook; or a function of stage, done and total
     options : fields of `smartnav_graph.estimate.config.RunConfig` that override it: vehicle, sensors, withhold,
         start_s, end_s, initial, rate, passes
 
@@ -111,33 +148,68 @@ def smooth(session: Session, config: Config | None = None, **options: Any) -> So
     ------
     SmartnavError
         Invalid input, or a problem that cannot be solved; the message says what to do.
+
+    Warns
+    -----
+    SmartnavWarning
+        A verdict that is not ``good``, with its reasons; data that are not used.
     """
-    return run(session, config, **options).solution
+    return run(session, config, progress=progress, **options).solution
 
 
-def replay(session: Session, config: Config | None = None, **options: Any) -> Solution:
+def replay(
+    session: Session,
+    config: Config | None = None,
+    *,
+    progress: bool | Progress = False,
+    **options: Unpack[RunOptions],
+) -> Solution:
     """The causal solution: every keyframe from the data available at its time. Otherwise as `smooth`."""
-    causal = run(session, config, causal=True, **options).causal
+    causal = run(session, config, causal=True, progress=progress, **options).causal
     assert causal is not None  # of a replay
     return causal
 
 
-def run(session: Session, config: Config | None = None, *, causal: bool = False, **options: Any) -> Run:
+def run(
+    session: Session,
+    config: Config | None = None,
+    *,
+    causal: bool = False,
+    progress: bool | Progress = False,
+    **options: Unpack[RunOptions],
+) -> Run:
     """All results of a run: solution, summary, errors at withheld measurements; of a replay (`causal`) both solutions.
 
-    Parameters and errors as `smooth`.
+    Parameters, errors and warnings as `smooth`.
     """
     import dataclasses
 
-    from smartnav_graph.core.errors import ConfigError
+    from smartnav_graph.core.errors import ConfigError, InputTypeError, warn
     from smartnav_graph.estimate.config import Config, RunConfig
     from smartnav_graph.estimate.replay import replay
     from smartnav_graph.estimate.run import smooth
+    from smartnav_graph.output.progress import progress as shown
+    from smartnav_graph.output.summary_json import run_warnings
+    from smartnav_graph.session.session import Session
 
+    if not isinstance(session, Session):
+        remedy = "sn.load(PATH) reads one, sn.Session.from_pandas(imu=..., gnss=...) and from_arrays build one"
+        raise InputTypeError("session", f"is {type(session).__name__}", "a Session", remedy)
+    if config is not None and not isinstance(config, Config):
+        remedy = "smartnav_graph.estimate.config.load(FILE) reads a config.toml"
+        raise InputTypeError("config", f"is {type(config).__name__}", "a Config", remedy)
     known = [field.name for field in dataclasses.fields(RunConfig)]
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ConfigError("smooth", f"unknown option {', '.join(unknown)}", f"some of {', '.join(known)}")
     config = config or Config()
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, **options))
-    return (replay if causal else smooth)(session, config)
+    estimate = replay if causal else smooth
+    if callable(progress):
+        found = estimate(session, config, progress=progress)
+    else:
+        with shown(not progress, notebook=progress) as show:
+            found = estimate(session, config, progress=show)
+    for text in run_warnings(found.summary):
+        warn(text)
+    return found

@@ -23,6 +23,12 @@ def dataset():
     return folder
 
 
+@pytest.fixture
+def warned(recwarn):
+    """The texts of the package's warnings so far."""
+    return lambda: "\n".join(str(one.message) for one in recwarn if issubclass(one.category, sn.SmartnavWarning))
+
+
 @pytest.fixture(scope="session")
 def kitti():
     """The KITTI drive that comes with gtsam; sessions are frozen, so one copy serves all."""

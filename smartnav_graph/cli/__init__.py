@@ -14,13 +14,14 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from smartnav_graph.core import interrupts
-from smartnav_graph.core.errors import SmartnavError
+from smartnav_graph.core.errors import SmartnavError, SmartnavWarning
 from smartnav_graph.core.text import inert
 
 if TYPE_CHECKING:
@@ -134,7 +135,8 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
             handler = logging.StreamHandler()
             handler.setFormatter(_Inert("%(message)s"))
             logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, handlers=[handler])
-            return command.run() or 0
+            with _plain_warnings(command.quiet):
+                return command.run() or 0
         except (SmartnavError, BrokenPipeError, SystemExit):
             raise
         except Exception as error:
@@ -144,6 +146,30 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
         finally:
             with interrupts.held():
                 remove_unfinished()
+
+
+@contextmanager
+def _plain_warnings(quiet: bool) -> Iterator[None]:
+    """Warnings of the package as lines on stderr, every one of them; none where `quiet`."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, SmartnavWarning):
+                print(message, file=sys.stderr)
+            else:
+                others(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        warnings.simplefilter("ignore" if quiet else "always", SmartnavWarning)
+        yield
 
 
 def _interrupted(number: int) -> int:

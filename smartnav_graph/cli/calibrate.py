@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -12,10 +12,10 @@ import tyro
 
 from smartnav_graph.calibrate import KINDS, calibrate_into
 from smartnav_graph.cli.calibrate_camera import PrintBoard, Undistort, camera_differences
-from smartnav_graph.cli.options import Command, Reporting, SourceName, Switch, Writing
-from smartnav_graph.cli.progress import progress
+from smartnav_graph.cli.options import Command, Reporting, SourceName, Switch, Writing, with_options
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing
+from smartnav_graph.output.progress import progress
 from smartnav_graph.session.calibration.model import load_calibration
 from smartnav_graph.session.calibration.pieces import Piece
 
@@ -42,7 +42,10 @@ class Calibrate(Command):
             raise ConfigError(
                 f"calibrate {word}", "is no kind of calibration", f"one of {', '.join([*KINDS, *commands])}"
             )
-        return _command_of(word), f"{name} {word}", arguments[1:]
+        row = KINDS[word]
+        options = row.options_class()
+        about = f"{(options.__doc__ or row.summary).strip()}\n\nExample: {row.example}"
+        return with_options(Calibrating, options, about, KIND=word), f"{name} {word}", arguments[1:]
 
 
 def _help() -> str:
@@ -88,23 +91,6 @@ class Calibrating(Command):
             write_calibration_report(self.report, self.KIND, piece, result.charts)
         print("\n".join(piece_lines(self.KIND, piece)))
         print(f"calibration: {self.out}" + (f", report: {self.report}" if self.report else ""))
-
-
-def _command_of(kind: str) -> type[Command]:
-    """The command of one kind: its own options beside the common ones."""
-    row = KINDS[kind]
-    options = row.options_class()
-    annotation = Annotated[tyro.conf.FlagConversionOff[options], tyro.conf.arg(name="")]  # type: ignore[valid-type]
-    made = dataclasses.make_dataclass(
-        "Calibrating",
-        [("options", annotation, field(default_factory=options))],
-        bases=(Calibrating,),
-        namespace={"KIND": kind},
-        frozen=True,
-        kw_only=True,
-    )
-    made.__doc__ = f"{(options.__doc__ or row.summary).strip()}\n\nExample: {row.example}"
-    return made
 
 
 @dataclass(frozen=True, kw_only=True)

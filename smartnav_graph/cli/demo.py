@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from smartnav_graph.cli.options import Command, OutPath
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text, withheld_lines
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.output.progress import progress
 
 if TYPE_CHECKING:
     from smartnav_graph.estimate.config import Config

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from smartnav_graph.cli.options import Reporting, RunPath, Switch
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import statistics_line
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing
+from smartnav_graph.output.progress import progress
 
 if TYPE_CHECKING:
     from smartnav_graph.evaluation import Evaluation

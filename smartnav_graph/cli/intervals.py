@@ -11,8 +11,8 @@ import numpy as np
 import tyro
 
 from smartnav_graph.cli.options import Reporting, SessionCommand, Switch, repairs
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.output.progress import progress
 
 if TYPE_CHECKING:
     from smartnav_graph.evaluation.intervals import FixesFromReference, Interval

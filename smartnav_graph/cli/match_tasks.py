@@ -13,8 +13,8 @@ from rich.table import Table
 
 from smartnav_graph import readers
 from smartnav_graph.cli.options import names
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SessionError
+from smartnav_graph.output.progress import progress
 from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.readers import match_file
 from smartnav_graph.readers.reference import load_reference

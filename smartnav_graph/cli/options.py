@@ -202,22 +202,22 @@ def repairs(text: str | None) -> tuple[str, ...]:
 def parse(kind: type[Command], name: str, arguments: Sequence[str]) -> Command:
     """The command with its options; raises SystemExit for help (0) and wrong usage (2)."""
     joined = join_values(arguments)
-    kind = _with_configuration(kind)
+    if issubclass(kind, Configured):
+        kind = with_options(kind, kind.configuration())
     default: Any = kind.defaults(joined)
     text = inspect.getdoc(kind)
     found: Command = tyro.cli(kind, prog=f"smartnav {name}", description=text, args=joined, default=default)
     return found
 
 
-def _with_configuration(kind: type[Command]) -> type[Command]:
-    """The class of a command with its configuration as options."""
-    if not issubclass(kind, Configured):
-        return kind
-    options = kind.configuration()
+def with_options(kind: type[Command], options: type, about: str | None = None, **constants: object) -> type[Command]:
+    """The class of a command with the fields of a dataclass as options; its text, and constants of the class."""
     annotation = Annotated[tyro.conf.FlagConversionOff[options], tyro.conf.arg(name="")]  # type: ignore[valid-type]
     row = ("options", annotation, field(default_factory=options))
-    made = dataclasses.make_dataclass(kind.__name__, [row], bases=(kind,), frozen=True, kw_only=True)
-    made.__doc__ = kind.__doc__
+    made = dataclasses.make_dataclass(
+        kind.__name__, [row], bases=(kind,), namespace=constants, frozen=True, kw_only=True
+    )
+    made.__doc__ = about or kind.__doc__
     return made
 
 

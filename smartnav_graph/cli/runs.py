@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from smartnav_graph.cli.options import Estimating, RunPath, Writing, given, repairs
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, run_text
 from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.output.progress import progress
 
 if TYPE_CHECKING:
     from smartnav_graph.estimate.config import Config

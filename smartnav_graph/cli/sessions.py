@@ -10,10 +10,10 @@ from typing import Annotated
 import tyro
 
 from smartnav_graph.cli.options import Command, Repairs, Reporting, SourceName, Switch, Text, Writing, repairs
-from smartnav_graph.cli.progress import progress
 from smartnav_graph.cli.text import print_findings, session_text
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import refuse_existing, refuse_foreign
+from smartnav_graph.output.progress import progress
 
 HEADER = "session.toml"
 

@@ -5,6 +5,9 @@ Every message reads ``<where>: <what was found>; expected <rule>; <what to do>``
 
 from __future__ import annotations
 
+import os
+import sys
+import warnings
 from pathlib import Path
 from typing import Self
 
@@ -72,3 +75,20 @@ class ConfigError(SmartnavError):
 
 class SolverError(SmartnavError):
     """The estimation problem is unobservable, diverged or left without data."""
+
+
+class InputTypeError(SmartnavError, TypeError):
+    """An argument of another type than a function takes; the message says what to build."""
+
+
+class SmartnavWarning(UserWarning):
+    """Data that are not used or were corrected, and results that are not to be relied upon."""
+
+
+def warn(message: str) -> None:
+    """Issue a `SmartnavWarning` at the line of the caller outside this package."""
+    package = os.path.dirname(os.path.dirname(__file__)) + os.sep
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(inert(message), SmartnavWarning, stacklevel=level)

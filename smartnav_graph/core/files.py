@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
-import logging
 import os
 import shutil
 import stat
@@ -18,14 +17,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from smartnav_graph.core.arrays import Column, Table
-from smartnav_graph.core.errors import SessionError, SmartnavError
+from smartnav_graph.core.errors import SessionError, SmartnavError, warn
 from smartnav_graph.core.interrupts import held
 
 ROW_GROUP = 1 << 20
 LARGEST_TOML = 10_000_000  # bytes
 UNFINISHED = ".writing"  # ending of the temporary folders
 _REPLACED = "replaced"
-_LOG = logging.getLogger(__name__)
 # What this process has written, and the temporary folders that it holds, with their locks.
 written: list[Path] = []
 _claimed: dict[Path, int] = {}
@@ -115,11 +113,11 @@ def _claim(scratch: Path, path: Path) -> None:
     if (scratch / _REPLACED).exists() and not os.path.lexists(path):
         os.replace(scratch / _REPLACED, path)
     for old in scratch.iterdir():
-        _LOG.warning("%s: left by a process that was killed; removed", old)
+        warn(f"{old}: left by a process that was killed; removed")
         _remove(old)
     for other in path.parent.glob(f".*{UNFINISHED}"):
         if other not in _claimed:
-            _LOG.warning("%s: of a process that is writing, or was killed; in the latter case remove it", other)
+            warn(f"{other}: of a process that is writing, or was killed; in the latter case remove it")
 
 
 def _release(scratch: Path) -> None:

@@ -113,6 +113,18 @@ class Gap:
         return (self.end_ns - self.start_ns) / NS
 
 
+def unix_ns(t_ns: ArrayLike, epoch: str) -> Times | None:
+    """Unix nanoseconds (UTC) of stamps on a clock ``unix`` or ``gps``; None on a clock that gives no date."""
+    stamps = np.asarray(t_ns, dtype=np.int64)
+    return stamps if epoch == "unix" else utc_from_gps(stamps) if epoch == "gps" else None
+
+
+def span_text(t_ns: Times) -> str:
+    """Length and rate of stamps (n,): ``471.5 s, 100 Hz``; empty without two of them."""
+    length = (int(t_ns[-1]) - int(t_ns[0])) / NS if len(t_ns) > 1 else 0.0
+    return f"{length:.1f} s, {1e9 / max(float(np.median(np.diff(t_ns))), 1.0):.3g} Hz" if length > 0 else ""
+
+
 def find_gaps(
     t_ns: Times,
     values: Floats,

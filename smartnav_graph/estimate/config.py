@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import tomli_w
 
@@ -66,6 +66,19 @@ class RunConfig:
                 raise ConfigError("--rate", f"{self.rate!r}", "keyframes, imu or a frequency in (0, 1000] Hz")
         if self.passes < 1:
             raise ConfigError("config [run]", f"passes = {self.passes}", ">= 1")
+
+
+class RunOptions(TypedDict, total=False):
+    """The fields of `RunConfig` as keyword arguments."""
+
+    vehicle: str
+    sensors: tuple[str, ...]
+    withhold: tuple[str, ...]
+    start_s: float | None
+    end_s: float | None
+    initial: str
+    rate: str
+    passes: int
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.tables import check
 from smartnav_graph.core.timebase import NS, Gap
@@ -36,7 +37,7 @@ TOO_LATE = "older than the lag"
 
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(Summarised):
     """One estimation problem. `session` lacks the withheld rows; rows of a stream keep their numbers in it. `imu` is
     the inertial stream of the windows, with its gaps bridged."""
 
@@ -56,6 +57,11 @@ class Problem:
     findings: Sequence[Finding] = ()
     heights: Mapping[str, HeightLevels] = field(default_factory=dict)
     camera_turns: GyroComparison | None = None
+
+    def facts(self) -> dict[str, str]:
+        """Windows, data gaps, builders."""
+        names = ", ".join(builder.name for builder in self.builders)
+        return {"windows": str(len(self.windows)), "gaps": str(len(self.gaps)), "builders": names}
 
     @property
     def vehicle(self) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from smartnav_graph.core import frames
+from smartnav_graph.core import figures, frames
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.core.timebase import NS
@@ -30,7 +31,7 @@ from smartnav_graph.estimate.result.assemble import (
 )
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
 from smartnav_graph.estimate.result.score_tests import unmodelled
-from smartnav_graph.estimate.result.summary import summarise
+from smartnav_graph.estimate.result.summary import run_facts, summarise
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.factors.prior import PriorBuilder
@@ -46,7 +47,7 @@ SECOND_STAGE_PASSES = 2
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(Summarised):
     """Everything one run gives. `summary` is what summary.json holds; `causal_windows` are those that a replay went
     through, one a row of `causal`; `estimate` is the solved graph behind `solution`, made with
     `pass_state`."""
@@ -60,6 +61,20 @@ class Run:
     diagnostics: Diagnostics | None = None
     estimate: Estimate | None = None
     pass_state: PassState = field(default_factory=PassState)
+
+    def facts(self) -> dict[str, str]:
+        """Verdict, mode, size, uncertainty, errors at withheld rows."""
+        return run_facts(self.summary)
+
+    def plot_residuals(self) -> figures.AxesList:
+        """Whitened residuals of every sensor over time, rejected rows marked, as axes of matplotlib.
+
+        Raises
+        ------
+        SmartnavError
+            matplotlib is not installed.
+        """
+        return self.solution.residuals.plot(self.solution.t0_ns)
 
     @property
     def session(self) -> Session:

@@ -20,9 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from smartnav_graph.core import figures
 from smartnav_graph.core.arrays import Floats, Mask, Times
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.so3 import log, rotate_back
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.evaluation.align import (
     FrameAlignment,
     StateSeries,
@@ -69,7 +71,7 @@ class RelativeError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class Evaluation(Summarised):
     """How a solution agrees with a reference.
 
     `nees` are averages, expected 3 for position, velocity and attitude and 1 for yaw; None where the covariance or
@@ -92,6 +94,32 @@ class Evaluation:
     rotation_error_deg: Floats | None
     sigma_enu: Floats
     notes: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, str]:
+        """Epochs, alignment, RMS errors, consistency."""
+        nees = ", ".join(f"{name} {value:.2f}" for name, value in self.nees.items() if value is not None)
+        return {
+            "epochs": f"{self.matched} of {self.matched + self.unmatched}, alignment {self.align}",
+            "position RMS": f"{self.ape_m.rmse:.3f} m",
+            **({} if self.rotation_deg is None else {"rotation RMS": f"{self.rotation_deg.rmse:.3f} deg"}),
+            **({"NEES (expected 3, yaw 1)": nees} if nees else {}),
+        }
+
+    def plot(self) -> figures.AxesList:
+        """Errors east, north, up with two sigmas of the solution, and of the rotation, as axes of matplotlib.
+
+        Raises
+        ------
+        SmartnavError
+            matplotlib is not installed.
+        """
+        panels = [
+            figures.Panel(f"{name}, m", self.error_enu_m[:, i], self.sigma_enu[:, i], around_zero=True)
+            for i, name in enumerate(("east", "north", "up"))
+        ]
+        if self.rotation_error_deg is not None:
+            panels.append(figures.Panel("rotation, deg", self.rotation_error_deg))
+        return figures.path_and_series(None, seconds_since(self.t_ns, int(self.t_ns[0])), panels)
 
     @property
     def matched(self) -> int:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from smartnav_graph.core import frames
+from smartnav_graph.core import figures, frames
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import quaternion
-from smartnav_graph.core.timebase import seconds_since
+from smartnav_graph.core.timebase import seconds_since, span_text, unix_ns
 from smartnav_graph.session.streams import Imu
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ROT, POS, VEL, ACCEL_BIAS, GYRO_BIAS = (slice(3 * i, 3 * i + 3) for i in range(5))
 COVARIANCE_NAMES = tuple(
@@ -24,9 +28,18 @@ COVARIANCE_NAMES = tuple(
     for axis in axes
 )
 
+# Columns of the sigmas, in the order of the covariance.
+SIGMA_NAMES = (
+    *(f"sigma_rot_{axis}_rad" for axis in "enu"),
+    *(f"sigma_{axis}_m" for axis in "enu"),
+    *(f"sigma_v{axis}_m_s" for axis in "enu"),
+    *(f"sigma_accel_bias_{axis}_m_s2" for axis in "xyz"),
+    *(f"sigma_gyro_bias_{axis}_rad_s" for axis in "xyz"),
+)
+
 
 @dataclass(frozen=True, kw_only=True)
-class Residuals:
+class Residuals(Summarised):
     """One row a scalar residual: time, sensor name, axis, whitened residual, robust weight, whether it was used."""
 
     t_ns: NDArray[np.int64]
@@ -38,6 +51,16 @@ class Residuals:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def facts(self) -> dict[str, str]:
+        """Scalar residuals of every sensor."""
+        return {"rows": str(len(self)), **{name: str(int(self.of(name).sum())) for name in self.sensors()}}
+
+    def plot(self, t0_ns: int) -> figures.AxesList:
+        """Residuals of every sensor over seconds since `t0_ns`, as axes of matplotlib; see `Solution.plot`."""
+        seconds = seconds_since(self.t_ns, t0_ns)
+        rows = [(name, self.of(name)) for name in self.sensors()]
+        return figures.scatter_rows([(name, seconds[m], self.whitened[m], self.used[m]) for name, m in rows])
 
     def of(self, sensor: str) -> NDArray[np.bool_]:
         """Mask of the rows of one sensor."""
@@ -61,14 +84,15 @@ class Residuals:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solution:
+class Solution(Summarised):
     """States at n epochs.
 
     t_ns (n,) int64 on the IMU's clock; nav_R_body (n, 3, 3); nav_t_body (n, 3) m; nav_v_body (n, 3) m/s;
     accel_bias (n, 3) m/s^2 and gyro_bias (n, 3) rad/s in body axes; covariance (n, 15, 15) in the order rotation,
     position, velocity (nav axes), accelerometer bias, gyroscope bias (body axes). The rotation error is the nav-axes
-    vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame. `imu` is the
-    inertial stream that carries the states from epoch to epoch, under `gravity` m/s^2; None where it is not known.
+    vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame,
+    `clock_epoch` that of the stamps (``unix``, ``gps``, ``boot``, ``unknown``). `imu` is the inertial
+    stream that carries the states from epoch to epoch, under `gravity` m/s^2; None where it is not known.
     """
 
     t_ns: NDArray[np.int64]
@@ -85,9 +109,22 @@ class Solution:
     residuals: Residuals = field(default_factory=Residuals.empty)
     imu: Imu | None = None
     gravity: float = frames.STANDARD_GRAVITY
+    clock_epoch: str = "unknown"
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def facts(self) -> dict[str, str]:
+        """Epochs, span, path, median sigmas."""
+        horizontal = np.hypot(*self.sigmas[:, 3:5].T)
+        median = {"horizontal": f"{np.median(horizontal):.3g} m", "height": f"{np.median(self.sigmas[:, 5]):.3g} m"}
+        sigma = ", ".join(f"{name} {text}" for name, text in median.items())
+        return {
+            "epochs": str(len(self)),
+            "span": span_text(self.t_ns),
+            "path": f"{self.path_length():.1f} m",
+            "sigma (median)": f"{sigma}, heading {np.median(self.sigma_heading_deg):.3g} deg",
+        }
 
     @property
     def seconds(self) -> Floats:
@@ -150,12 +187,44 @@ class Solution:
                 columns[f"cov_{row}__{COVARIANCE_NAMES[j]}"] = self.covariance[:, i, j]
         return columns
 
-    def to_pandas(self) -> Any:
-        """The trajectory with biases as a pandas DataFrame indexed by seconds since time zero."""
+    def to_pandas(self) -> pd.DataFrame:
+        """The columns of trajectory.csv, biases, and one sigma of every state, as a pandas DataFrame.
+
+        The index is the time in UTC where the clock gives a date (`clock_epoch` ``unix`` or ``gps``), with the seconds
+        since time zero as a column ``seconds``; else these seconds. Sigmas: ``sigma_rot_e_rad`` ... of the rotation
+        about east, north, up; ``sigma_e_m``, ``sigma_ve_m_s``, ``sigma_accel_bias_x_m_s2``,
+        ``sigma_gyro_bias_x_rad_s`` ...
+        """
         import pandas as pd
 
         columns = {name: value for name, value in self.all_columns().items() if not name.startswith("cov_")}
-        return pd.DataFrame(columns, index=pd.Index(self.seconds, name="seconds"))
+        columns |= dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True))
+        unix = unix_ns(self.t_ns, self.clock_epoch)
+        if unix is None:
+            return pd.DataFrame(columns, index=pd.Index(self.seconds, name="seconds"))
+        return pd.DataFrame({"seconds": self.seconds} | columns, index=pd.DatetimeIndex(unix, tz="UTC", name="time"))
+
+    def plot(self) -> figures.AxesList:
+        """Path, and height, speed and heading over time, with bands of two sigmas, as axes of matplotlib.
+
+        ``solution.plot()[0].figure.savefig("run.png")`` writes a file; a notebook shows the figure by itself.
+
+        Raises
+        ------
+        SmartnavError
+            matplotlib is not installed.
+        """
+        e, n, u = self.nav_t_body.T
+        speed = np.linalg.norm(self.nav_v_body, axis=1)
+        along = self.nav_v_body / np.maximum(speed, 1e-9)[:, None]
+        spread = np.sqrt(np.clip(np.einsum("ni,nij,nj->n", along, self.covariance[:, VEL, VEL], along), 0.0, None))
+        heading = np.degrees(np.unwrap(np.radians(self.heading_pitch_roll_deg[:, 0])))
+        panels = (
+            figures.Panel("height, m", u, self.sigmas[:, 5]),
+            figures.Panel("speed, m/s", speed, spread),
+            figures.Panel("heading, deg", heading, self.sigma_heading_deg),
+        )
+        return figures.path_and_series(figures.Path("east, m", "north, m", e, n), self.seconds, panels)
 
 
 def read(path: str | Path) -> dict[str, NDArray[Any]]:
@@ -176,6 +245,7 @@ def from_columns(
     residuals: Residuals | None = None,
     imu: Imu | None = None,
     gravity: float = frames.STANDARD_GRAVITY,
+    clock_epoch: str = "unknown",
 ) -> Solution:
     """The inverse of `Solution.all_columns`."""
 
@@ -202,4 +272,5 @@ def from_columns(
         residuals=residuals or Residuals.empty(),
         imu=imu,
         gravity=gravity,
+        clock_epoch=clock_epoch,
     )

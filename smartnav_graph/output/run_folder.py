@@ -20,11 +20,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from smartnav_graph.core import figures
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import read_table, refuse_existing, refuse_foreign, replacing, write_table
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate import config as config_model
+from smartnav_graph.estimate.result.summary import run_facts
 from smartnav_graph.estimate.run import Run
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.evaluation.influence import Influence
@@ -45,13 +48,21 @@ UNSTEADY = ("timings_s", "real_time_factor", "peak_memory_mb", "update_ms")
 
 
 @dataclass(frozen=True)
-class StoredRun:
+class StoredRun(Summarised):
     """A run read back: the smoothed states, the causal ones of a replay, and the table of summary.json."""
 
     path: Path
     solution: Solution
     summary: Summary
     causal: Solution | None = None
+
+    def facts(self) -> dict[str, str]:
+        """Folder, verdict, mode, size, uncertainty, errors at withheld rows."""
+        return {"path": str(self.path), **run_facts(self.summary)}
+
+    def plot_residuals(self) -> figures.AxesList:
+        """As `Run.plot_residuals`."""
+        return self.solution.residuals.plot(self.solution.t0_ns)
 
     @property
     def clock_epoch(self) -> str:
@@ -301,6 +312,7 @@ def _frame(session: Mapping[str, Any], imu: Path) -> dict[str, Any]:
     """What a solution needs of the session it was estimated from, and its inertial data, which an older run has not."""
     origin = None if session["origin"] is None else Origin(**session["origin"])
     found: dict[str, Any] = {"t0_ns": int(session["t0_ns"]), "origin": origin}
+    found["clock_epoch"] = text_of(session, "clock_epoch") or "unknown"
     if imu.is_file():
         found |= {"imu": Imu.from_columns(read_table(imu)), "gravity": float(session["gravity_m_s2"])}
     return found | {key: str(session[key]) for key in ("forward", "up")}

@@ -91,6 +91,13 @@ def other_warnings(summary: Summary) -> list[str]:
     return [text for text in map(str, list_of(summary, "warnings")) if not text.startswith(tuple(reasons))]
 
 
+def run_warnings(summary: Summary) -> list[str]:
+    """A verdict that is not ``good`` with its reasons, and the other warnings."""
+    verdict = verdict_lines(summary)
+    doubted = text_of(table_of(summary, "verdict"), "level") not in ("", "good")
+    return [*(["\n  ".join(verdict)] if doubted else []), *other_warnings(summary)]
+
+
 def plain(value: object) -> object:
     """Plain JSON types: no NumPy scalar, and null for what is not finite."""
     if isinstance(value, Mapping):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import MISSING
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.core.arrays import Column, Table, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.source import Reader, build_session
 from smartnav_graph.readers.stamps import is_date
@@ -22,7 +21,6 @@ from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
 
-_log = logging.getLogger(__name__)
 _STAMPS = {"t_s": NS, "t_ms": NS // 10**3, "t_us": NS // 10**6}  # columns that give t_ns in another unit
 
 
@@ -68,7 +66,7 @@ def _columns(kind: type[Stream], table: TextTable) -> Table:
     table = _small_letters(table, kinds)
     unknown = ", ".join(name for name in table.cells if name not in kinds and name not in _STAMPS)
     if unknown:
-        _log.warning("%s: unknown column %s; kept, but not used", table.path, unknown)
+        warn(f"{table.path}: unknown column {unknown}; kept, but not used")
     columns: Table = {}
     for spec in kind.specs():
         names = spec.metadata["columns"]

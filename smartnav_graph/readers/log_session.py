@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.core.arrays import Table
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.axes import find_body_axes
@@ -118,7 +118,7 @@ def log_session(
     if parts.refused is not None and "gnss" not in parts.tables:
         raise parts.refused
     if parts.refused is not None:
-        _log.warning("%s; fixes only are read", parts.refused)
+        warn(f"{parts.refused}; fixes only are read")
     if not parts.tables:
         left_out = "; ".join(f"{n} rows {why}" for counts in parts.counts.values() for why, n in counts.items())
         what = f"holds no stream ({left_out})" if left_out else "holds no stream"

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.display import Summarised
+from smartnav_graph.core.errors import InputTypeError, SessionError, warn
 from smartnav_graph.core.frames import LocalFrame, Origin
-from smartnav_graph.core.timebase import NS, seconds_since, utc_from_gps
+from smartnav_graph.core.timebase import NS, seconds_since, span_text, unix_ns
 from smartnav_graph.session.calibration.model import Calibration
-from smartnav_graph.session.stream import Located, Positioned
+from smartnav_graph.session.from_arrays import build_streams, first_origin
+from smartnav_graph.session.stream import Located, Positioned, Stream
 from smartnav_graph.session.streams import Imu, Streams
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 EPOCHS = ("unix", "gps", "boot", "unknown")
 VEHICLES = ("none", "car", "trolley", "foot")
 MOUNTINGS = ("auto", "foot", "body")
 # Mounts: largest lever arm; how far a matrix may be from a rotation; what is no more than rounding.
 FARTHEST_M, ROTATION_ERROR, ROUNDING = 1000.0, 1e-3, 1e-6
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Mount:
             found, rule = f"body_R = {R.tolist()}", f"the rows of a rotation, to {ROTATION_ERROR:g}"
             raise SessionError("session.toml [sensors]", found, rule, "give the axes of the sensor in body axes")
         if off > ROUNDING:
-            _LOG.warning("session.toml [sensors]: body_R is a rotation to %.1e only; the nearest rotation is used", off)
+            warn(f"session.toml [sensors]: body_R is a rotation to {off:.1e} only; the nearest rotation is used")
             u, _, vt = np.linalg.svd(R)
             object.__setattr__(self, "body_R", tuple(tuple(row) for row in (u @ vt).tolist()))
 
@@ -87,7 +90,7 @@ _AT_ORIGIN = Mount()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Session(Streams):
+class Session(Summarised, Streams):
     """Everything recorded, on one clock: its streams and what is known of the device.
 
     `origin` may be absent (metric local positions only). `gravity_m_s2` overrides normal gravity. `repairs` names the
@@ -120,6 +123,112 @@ class Session(Streams):
                     "give lat_deg, lon_deg and height_m of the origin",
                     stream=name,
                 )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        device: Device | None = None,
+        clock_epoch: str | None = None,
+        origin: Origin | None = None,
+        gravity_m_s2: float | None = None,
+        sensors: Mapping[str, Mount] | None = None,
+        calibration: Calibration | None = None,
+        repairs: Iterable[str] = (),
+        **streams: Stream | Mapping[str, ArrayLike] | pd.DataFrame,
+    ) -> Session:
+        """A session of arrays: ``from_arrays(imu={"time": t, "gyro": gyro, "accel": accel}, gnss={...})``.
+
+        Parameters
+        ----------
+        device : body axes that point forward and up, and what carries the device; by default as a phone lying flat
+        clock_epoch : of whole nanoseconds: ``unix``, ``gps``, ``boot`` or ``unknown``; datetimes are ``unix``
+        origin : of the local frame; by default the first latitude, longitude and height
+        gravity_m_s2, sensors, calibration : as the fields of the class
+        repairs : names of `smartnav_graph.session.repair`, such as ``order``, ``nan``, ``units``; what they touched is
+            counted in `dropped`
+        streams : by name (``imu``, ``gnss``, ``control`` ...), each a stream, or a mapping of its arrays by name of
+            field (``gyro`` (n, 3) rad/s) or of column (``gyro_x_rad_s``), with its times (n,) as ``time``: datetime64
+            of any unit (UTC where there is no time zone), timedelta64, or whole nanoseconds. Columns and units:
+            docs/session-format.md
+
+        Raises
+        ------
+        InputTypeError
+            A stream or a time of another type; it is a TypeError, and says what to build.
+        SessionError
+            A column, row, time or unit that does not fit.
+        """
+        built, epoch, dropped = build_streams(streams, clock_epoch, repairs)
+        located = [one for one in built.values() if isinstance(one, Located)]
+        found = cls(
+            device=device or Device(),
+            clock_epoch=epoch,
+            origin=origin or next((first for one in located if (first := first_origin(one)) is not None), None),
+            gravity_m_s2=gravity_m_s2,
+            sensors=sensors or {},
+            calibration=calibration,
+            dropped=dropped,
+            **built,
+        )
+        return found._in_right_units(repairs)
+
+    @classmethod
+    def from_pandas(
+        cls,
+        *,
+        device: Device | None = None,
+        clock_epoch: str | None = None,
+        origin: Origin | None = None,
+        gravity_m_s2: float | None = None,
+        sensors: Mapping[str, Mount] | None = None,
+        calibration: Calibration | None = None,
+        repairs: Iterable[str] = (),
+        **streams: pd.DataFrame | Stream,
+    ) -> Session:
+        """A session of DataFrames with the columns of docs/session-format.md: ``from_pandas(imu=imu, gnss=fixes)``.
+
+        The times of a DataFrame are its column ``time``, ``timestamp`` or ``t_ns``, or else its index. Other parameters
+        and errors as `from_arrays`.
+        """
+        for name, frame in streams.items():
+            if not isinstance(frame, Stream) and not hasattr(frame, "columns"):
+                remedy = "arrays go to Session.from_arrays"
+                raise InputTypeError(name, f"is {type(frame).__name__}", "a pandas DataFrame", remedy)
+        return cls.from_arrays(
+            device=device,
+            clock_epoch=clock_epoch,
+            origin=origin,
+            gravity_m_s2=gravity_m_s2,
+            sensors=sensors,
+            calibration=calibration,
+            repairs=repairs,
+            **streams,
+        )
+
+    def _in_right_units(self, repairs: Iterable[str]) -> Session:
+        """Checked for readings in another unit, or converted by the repair ``units``."""
+        from smartnav_graph.session import health
+        from smartnav_graph.session.health.units import in_right_units, without_wrong_units
+
+        if self.imu is None or len(self.imu) < 2:
+            return self
+        if "units" in repairs:
+            return in_right_units(self)
+        for name in without_wrong_units(self, health.inspect(self).findings)[1]:
+            warn(f"{name}: in another unit, and not used; convert it, or add repairs=('units',)")
+        return self
+
+    def facts(self) -> dict[str, str]:
+        """Device, clock, origin, and rows of every stream."""
+        shown = {"device": f"{self.device.name}, forward {self.device.forward}, up {self.device.up}"}
+        unix = unix_ns(self.t0_ns, self.clock_epoch)
+        shown["start"] = f"clock {self.clock_epoch}" if unix is None else f"{np.datetime64(int(unix), 'ns')} UTC"
+        if self.origin is not None:
+            shown["origin"] = f"{self.origin.lat_deg:.7f}, {self.origin.lon_deg:.7f}, {self.origin.height_m:.3f} m"
+        for name, stream in self.streams().items():
+            shown[name] = ", ".join(filter(None, [f"{len(stream)} rows", span_text(stream.t_ns)]))
+        return shown
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -187,10 +296,10 @@ class Session(Streams):
     @property
     def year(self) -> float:
         """Decimal year of time zero; 2025 where the clock is no date."""
-        if self.clock_epoch not in ("unix", "gps"):
+        unix = unix_ns(self.t0_ns, self.clock_epoch)
+        if unix is None:
             return 2025.0
-        unix_ns = int(utc_from_gps(np.array(self.t0_ns))) if self.clock_epoch == "gps" else self.t0_ns
-        return 1970.0 + unix_ns / NS / (365.2425 * 86400.0)
+        return 1970.0 + int(unix) / NS / (365.2425 * 86400.0)
 
     @cached_property
     def magnetic_field_ut(self) -> Floats | None:

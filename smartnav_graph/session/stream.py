@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Column, Floats, Indices, Mask, Table, Times
-from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.display import Summarised
+from smartnav_graph.core.errors import InputTypeError, SessionError
+from smartnav_graph.core.timebase import NS, span_text
 
 LATEST_NS = 1 << 62
 _DTYPES = {"float": np.float64, "int": np.int64, "text": np.object_}
@@ -56,7 +57,7 @@ class Label(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stream:
+class Stream(Summarised):
     """Base of every stream. `t_ns` (n,) int64 on the session's clock; `extra` keeps unknown columns."""
 
     NAME: ClassVar[str]
@@ -72,6 +73,12 @@ class Stream:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def facts(self) -> dict[str, str]:
+        """Rows, span, rate, fields."""
+        known = [spec.name for spec in self.specs() if spec.name != "t_ns" and getattr(self, spec.name) is not None]
+        span = span_text(self.t_ns)
+        return {"rows": str(len(self)), **({"span": span} if span else {}), "fields": ", ".join([*known, *self.extra])}
 
     @property
     def available_ns(self) -> Times:
@@ -96,6 +103,8 @@ class Stream:
 
     def _checked(self, spec: Field[object], value: ArrayLike) -> Column:
         names, kind = spec.metadata["columns"], spec.metadata["kind"]
+        if kind == "int":
+            self._refuse_other_times(spec.name, value)
         owned = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
         array: Column = np.array(value, dtype=_DTYPES[kind], copy=None if owned else True)
         shape = (len(self.t_ns),) if len(names) == 1 else (len(self.t_ns), len(names))
@@ -113,6 +122,17 @@ class Stream:
             self._check_limit(array, names, spec.metadata["limit"])
         array.flags.writeable = False
         return array
+
+    @classmethod
+    def _refuse_other_times(cls, name: str, value: object) -> None:
+        """Whole numbers are given as such: of seconds and of datetimes the unit would be lost."""
+        kind = np.asarray(value).dtype.kind
+        if kind not in "iub" and np.size(np.asarray(value)):
+            what = {"f": "floating numbers", "M": "datetimes", "m": "timedeltas"}.get(kind, "no numbers")
+            remedy = "build the session with Session.from_arrays, which takes datetime64, or convert seconds with "
+            raise InputTypeError(
+                f"{cls.__name__}.{name}", f"holds {what}", "int64", remedy + "np.round(s * 1e9).astype('int64')"
+            )
 
     def _check_limit(self, array: Column, names: tuple[str, ...], limit: float) -> None:
         beyond = np.argwhere(np.abs(array) > limit)

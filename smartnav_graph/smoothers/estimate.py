@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Indices
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SolverError
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, SessionState, State, dims_of, key
 from smartnav_graph.graph.update import FactorBatch, FactorId, GraphUpdate
@@ -58,7 +59,7 @@ class Posterior:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(Summarised):
     """What a smoother ends with.
 
     values : gtsam.Values at the solution; indices, t_ns : keyframes, in time order
@@ -81,6 +82,17 @@ class Estimate:
     marginals: Posterior
     session: Mapping[str, SessionValue] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def facts(self) -> dict[str, str]:
+        """Keyframes, factors, iterations, cost."""
+        ended = "converged" if self.converged else "not converged"
+        factors = len(self.factors) + sum(len(block.keys) for block in self.blocks)
+        return {
+            "keyframes": str(len(self.indices)),
+            "factors": str(factors),
+            "iterations": f"{self.iterations}, {ended}",
+            "cost": f"{self.cost:.6g}",
+        }
 
     @property
     def held(self) -> Mapping[int, Floats]:

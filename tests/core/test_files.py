@@ -113,18 +113,18 @@ def test_a_second_writer_is_refused(target):
     assert read(path) == "new" and names(path.parent) == ["result"]
 
 
-def test_what_a_killed_process_left_is_named_and_removed(target, caplog):
+def test_what_a_killed_process_left_is_named_and_removed(target, warned):
     path, kind = target
     scratch = path.parent / ".result.writing"
     scratch.mkdir()
     write(scratch / "result", kind, "half")
     with replacing(path) as new:
         write(new, kind, "new")
-    assert caplog.messages == [f"{scratch / 'result'}: left by a process that was killed; removed"]
+    assert warned() == f"{scratch / 'result'}: left by a process that was killed; removed"
     assert read(path) == "new" and names(path.parent) == ["result"]
 
 
-def test_the_old_is_put_back_where_a_kill_came_between_two_moves(target, caplog):
+def test_the_old_is_put_back_where_a_kill_came_between_two_moves(target, warned):
     path, kind = target
     scratch = path.parent / ".result.writing"
     scratch.mkdir()
@@ -134,12 +134,12 @@ def test_the_old_is_put_back_where_a_kill_came_between_two_moves(target, caplog)
     assert read(path) == "old" and names(path.parent) == ["result"]
 
 
-def test_another_unfinished_folder_is_named_and_stays(target, caplog):
+def test_another_unfinished_folder_is_named_and_stays(target, warned):
     path, kind = target
     (path.parent / ".other.writing").mkdir()
     with replacing(path) as new:
         write(new, kind, "new")
-    assert ".other.writing: of a process that is writing, or was killed" in caplog.text
+    assert ".other.writing: of a process that is writing, or was killed" in warned()
     assert names(path.parent) == [".other.writing", "result"]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate
 from smartnav_graph.core.timebase import NS, interpolate, ns_from_seconds
@@ -54,11 +55,16 @@ class SolvedProblem:
 
 
 @dataclass(frozen=True)
-class Withheld:
+class Withheld(Summarised):
     """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes."""
 
     t_ns: NDArray[np.int64]
     error: Floats
+
+    def facts(self) -> dict[str, str]:
+        """Rows and RMS of the errors."""
+        rms = np.sqrt((self.error**2).sum(axis=1).mean()) if len(self.error) else np.nan
+        return {"rows": str(len(self.t_ns)), "RMS": f"{rms:.3f} m"}
 
     def to_dict(self) -> dict[str, float | int]:
         """Count, horizontal and 3-D RMS, largest 3-D error, metres."""
@@ -91,6 +97,7 @@ def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, cov
         up=session.device.up,
         imu=problem.imu,
         gravity=session.gravity,
+        clock_epoch=session.clock_epoch,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.display import Summarised
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.graph.pass_state import PassState
@@ -169,13 +170,18 @@ def _lets_go(factor: object) -> bool:
 
 
 @dataclass(frozen=True)
-class Diagnostics:
+class Diagnostics(Summarised):
     """All of it. keyframe_ns (n,) : stamps of the keyframes; the index of a keyframe is its place."""
 
     keyframe_ns: Ints
     layout: FactorGraphLayout
     pairs: ImagePairs | None = None
     updates: Updates | None = None
+
+    def facts(self) -> dict[str, str]:
+        """What there is of a run."""
+        there = {name: getattr(self, name) is not None for name in ("pairs", "updates")}
+        return {"keyframes": str(len(self.keyframe_ns)), **{k: "kept" if v else "none" for k, v in there.items()}}
 
     @classmethod
     def of(

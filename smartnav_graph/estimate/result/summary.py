@@ -74,6 +74,19 @@ def _doubts(estimate: Estimate, mode: str, chi2: float) -> list[str]:
     return doubts
 
 
+def run_facts(summary: Mapping[str, Any]) -> dict[str, str]:
+    """What is shown of a run in one line: verdict, mode, size, uncertainty, errors at withheld rows."""
+    sigma, withheld = summary["position_sigma_m"]["median"], summary.get("withheld") or {}
+    errors = (f"{name} {one['rms_horizontal_m']:.3f} m of {one['count']}" for name, one in withheld.items())
+    return {
+        "verdict": str(summary.get("verdict", {}).get("level", "none")),
+        "mode": str(summary["mode"]),
+        "span": f"{summary['duration_s']:.1f} s, {summary['path_m']:.1f} m, {summary['keyframes']} keyframes",
+        "horizontal sigma (median)": f"{sigma:.3f} m",
+        **({"withheld (horizontal RMS)": ", ".join(errors)} if withheld else {}),
+    }
+
+
 def summarise(
     solved: SolvedProblem,
     initial: InitialState,

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import csv
 import json
-import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.readers.axes import sign_by_turn
 from smartnav_graph.readers.fixes import LoggedFixes
@@ -28,7 +27,6 @@ from smartnav_graph.readers.text import TextTable, read_bytes, read_text
 from smartnav_graph.readers.text_lines import head_of, heading_of
 from smartnav_graph.session.session import Session
 
-_log = logging.getLogger(__name__)
 _SENSORS = (
     *("Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope"),
     *("GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Barometer"),
@@ -265,7 +263,7 @@ def _likely_sign(path: Path, force: Samples, by_turn: float) -> float:
     how = "turns of the gyroscope and the course of the fixes agree so"
     if not by_turn:
         how = "a phone mostly lies on its back or with its top up; else give the Metadata.csv of the app"
-    _log.warning("%s: no Metadata: taken as of %s: %s", path, system, how)
+    warn(f"{path}: no Metadata: taken as of {system}: {how}")
     return sign
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.frames import STANDARD_GRAVITY
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import LoggedFixes
@@ -99,7 +99,7 @@ def _table(path: Path) -> tuple[TextTable, Times, Floats]:
     t_ns = table.times("0")
     begins = np.concatenate([[False], np.diff(t_ns) < -WEEK_NS // 2])
     if begins.any():
-        _log.warning("%s: the time of week begins anew at row %d: a week is added", path, int(np.argmax(begins)))
+        warn(f"{path}: the time of week begins anew at row {int(np.argmax(begins))}: a week is added")
     return table, t_ns + np.cumsum(begins) * WEEK_NS, table.floats(*map(str, range(1, width)))
 
 

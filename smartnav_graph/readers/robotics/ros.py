@@ -8,14 +8,13 @@ the IMU is carried over by the stamps of the recorder.
 
 from __future__ import annotations
 
-import logging
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Mask, Table, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.readers.axes import BodyAxes
@@ -28,8 +27,6 @@ from smartnav_graph.readers.robotics.sensor_choice import check_sensor_names, se
 from smartnav_graph.readers.samples import Samples, carried, clock_offset, in_time_order
 from smartnav_graph.readers.source import Reader, vector_columns
 from smartnav_graph.session.session import Session
-
-_log = logging.getLogger(__name__)
 
 OTHER_CLOCK_S = 1.0  # a topic delivered so much later than the IMU, or before it was measured, is on another clock
 UNIX_SINCE_NS = int(np.datetime64("2000-01-01", "ns").astype(np.int64))  # a simulated clock begins at zero
@@ -98,8 +95,8 @@ class _Clock:
         shift = self._delay(topic) - self._delay_ns
         if abs(shift) < OTHER_CLOCK_S * NS:
             return topic.t_ns
-        text = "%s: stamps of %s are %.3f s off those of %s by the stamps of the recorder; %.3f s are added"
-        _log.warning(text, self.path, topic.name, -shift / NS, self.first.name, shift / NS)
+        off = f"stamps of {topic.name} are {-shift / NS:.3f} s off those of {self.first.name}"
+        warn(f"{self.path}: {off} by the stamps of the recorder; {shift / NS:.3f} s are added")
         return topic.t_ns + shift
 
     def samples(self, topic: Topic, columns: slice, factor: float = 1.0) -> Samples:
@@ -152,8 +149,8 @@ def _add_velocity(clock: _Clock, parts: LogParts, topic: Topic, imu_frame: str, 
     elif axes.forward_found and "wheel" not in parts.tables:
         parts.add("wheel", velocity.file, {"t_ns": velocity.t_ns, "speed_m_s": velocity.values[:, 0]}, velocity.counts)
     else:
-        text = "%s: %s is not used: its axes (frame %r) are neither those of the fixes nor those of the IMU"
-        _log.warning(text, clock.path, topic.name, topic.frame)
+        axes_text = f"its axes (frame {topic.frame!r}) are neither those of the fixes nor those of the IMU"
+        warn(f"{clock.path}: {topic.name} is not used: {axes_text}")
 
 
 def _is_of_fixes(velocity: Samples, fixes: Table) -> bool:

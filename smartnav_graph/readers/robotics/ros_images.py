@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from smartnav_graph.core.arrays import Table, Times
+from smartnav_graph.core.errors import warn
 from smartnav_graph.readers.robotics.ros_bag import IMAGES, Message, Topic, messages, opened
-
-_log = logging.getLogger(__name__)
 
 LARGEST = 20_000  # pixels of a side
 # Encoding (sensor_msgs/image_encodings.hpp) -> type, channels, conversion of OpenCV to grey or blue-green-red.
@@ -60,8 +58,8 @@ def image_table(cameras: Sequence[tuple[Topic, Times]]) -> Table:
     for topic, _ in cameras:
         unknown = sorted({text for text in topic.texts if not _name(topic, 0, text, topic.kind)})
         if unknown:
-            text = "%s: images in %s are not written: only %s are"
-            _log.warning(text, topic.name, ", ".join(map(repr, unknown)), ", ".join(_ENCODINGS))
+            encodings = ", ".join(map(repr, unknown))
+            warn(f"{topic.name}: images in {encodings} are not written: only {', '.join(_ENCODINGS)} are")
     names = [_folder(topic.name) for topic, times in cameras for _ in times]
     return {
         "t_ns": t_ns[order],
@@ -94,7 +92,7 @@ def write_bag_pictures(path: Path, folder: Path) -> None:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
     for topic, n in faulty.items():
-        _log.warning("%s: %d of %d images of %s are not written", path, n, count[topic] + 1, topic)
+        warn(f"{path}: {n} of {count[topic] + 1} images of {topic} are not written")
 
 
 def _encoded(message: Message) -> bytes:

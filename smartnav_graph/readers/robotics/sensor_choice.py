@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 
-_log = logging.getLogger(__name__)
 _ALIKE = 0.9  # rates within this ratio count as equal
 
 
@@ -46,8 +44,8 @@ def select_sensor(path: Path, what: str, parts: Sequence[P], names: Sequence[str
     found = named[0] if named else next(part for part in parts if part.rate_hz >= _ALIKE * fastest)
     if not named and len(parts) > 1:
         others = ", ".join(f"{part.name} ({part.rate_hz:.0f} Hz)" for part in parts if part is not found)
-        text = "%s: %s of %s (%.0f Hz), the fastest or first; there are also %s: choose one by %s#NAME"
-        _log.warning(text, path, what, found.name, found.rate_hz, others, path.name)
+        chosen = f"{what} of {found.name} ({found.rate_hz:.0f} Hz), the fastest or first"
+        warn(f"{path}: {chosen}; there are also {others}: choose one by {path.name}#NAME")
     return found
 
 

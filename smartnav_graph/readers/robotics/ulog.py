@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from typing import Protocol, cast
 import numpy as np
 
 from smartnav_graph.core.arrays import Column, Floats, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.log_session import LogParts, log_session
@@ -28,8 +27,6 @@ from smartnav_graph.readers.robotics.sensor_choice import check_sensor_names, se
 from smartnav_graph.readers.samples import Samples, in_time_order
 from smartnav_graph.readers.source import Reader, first_bytes
 from smartnav_graph.session.session import Session
-
-_log = logging.getLogger(__name__)
 
 MAGIC = b"ULog\x01\x12\x35"
 MESSAGES = (
@@ -127,14 +124,14 @@ def _opened(path: Path) -> _Log:
         reason = str(error) or type(error).__name__
         raise SessionError(path, f"cannot be read ({reason})", "a whole log of PX4", "copy it again") from error
     if log.file_corruption:
-        _log.warning("%s: parts of the log are damaged and left out", path)
+        warn(f"{path}: parts of the log are damaged and left out")
     return log
 
 
 def _report_dropouts(path: Path, log: _Log) -> None:
     if log.dropouts:
         lost = sum(int(getattr(dropout, "duration", 0)) for dropout in log.dropouts)
-        _log.warning("%s: %d dropouts of the logger, %d ms in all", path, len(log.dropouts), lost)
+        warn(f"{path}: {len(log.dropouts)} dropouts of the logger, {lost} ms in all")
 
 
 def _times(data: Mapping[str, Column]) -> Times:

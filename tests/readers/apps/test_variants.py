@@ -126,8 +126,8 @@ def test_straight_on_nothing_shows_it():
     assert sign_by_turn(force, gyro, slow) == 0.0
 
 
-def test_without_metadata_the_system_is_guessed_and_said(tmp_path, caplog):
+def test_without_metadata_the_system_is_guessed_and_said(tmp_path, warned):
     folder = sensor_logger(tmp_path / "x", system="ios", total=False)
     (folder / "Metadata.csv").unlink()
     check(readers.read(folder))
-    assert "no Metadata: taken as of iOS (opposite sign): a phone mostly lies on its back" in caplog.text
+    assert "no Metadata: taken as of iOS (opposite sign): a phone mostly lies on its back" in warned()

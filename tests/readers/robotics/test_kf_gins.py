@@ -1,7 +1,5 @@
 """KF-GINS text: increments, sigmas north east down, time of week; what is no such file."""
 
-import logging
-
 import numpy as np
 import pytest
 
@@ -41,13 +39,12 @@ def test_increments_become_rates_and_specific_force(tmp_path):
     assert (session.device.forward, session.device.up) == ("+x", "-z")
 
 
-def test_the_end_of_the_week(tmp_path, caplog):
+def test_the_end_of_the_week(tmp_path, warned):
     path = tmp_path / "GNSS.txt"
     path.write_text(fixes(first=604_790.0, rows=80))
-    with caplog.at_level(logging.WARNING):
-        gnss = readers.read(path).gnss
+    gnss = readers.read(path).gnss
     assert (np.diff(gnss.t_ns) == 10**9).all() and len(gnss) == 80
-    assert "begins anew at row 10" in caplog.text
+    assert "begins anew at row 10" in warned()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """PX4 logs: golden values, marks, several inertial sensors, damaged logs."""
 
-import logging
-
 import numpy as np
 import pytest
 from ulogs import ulog
@@ -90,11 +88,10 @@ def test_rows_without_a_fix_and_invalid_velocities_are_no_values(tmp_path):
     assert np.isnan(gnss.velocity[-1]).all() and np.isnan(gnss.lla[-1, 2])  # two dimensions: no height
 
 
-def test_the_other_inertial_sensors_are_named_and_can_be_chosen(tmp_path, caplog):
+def test_the_other_inertial_sensors_are_named_and_can_be_chosen(tmp_path, warned):
     path = write(tmp_path, flight())
-    with caplog.at_level(logging.WARNING):
-        readers.read(path)
-    assert "imu of sensor_combined (200 Hz)" in caplog.text and "vehicle_imu.1 (20 Hz)" in caplog.text
+    readers.read(path)
+    assert "imu of sensor_combined (200 Hz)" in warned() and "vehicle_imu.1 (20 Hz)" in warned()
     other = readers.read(f"{path}#vehicle_imu.1").imu
     assert other.t_ns[0] == 20_000_000_000  # of the sample, not of the message
     np.testing.assert_allclose(other.gyro[0], [0.2, 0.0, 0.4], rtol=1e-6)  # increments over 5 ms

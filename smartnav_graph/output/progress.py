@@ -15,23 +15,54 @@ from rich.progress import Progress as Bar
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.output.text import duration
 
-# Seconds between two updates of the bar.
+# Seconds between two updates of the bar, and of a line of text.
 PERIOD_S = 0.1
+PLAIN_PERIOD_S = 0.5
 
 
 @contextmanager
-def progress(quiet: bool) -> Iterator[Progress]:
+def progress(quiet: bool, *, notebook: bool = False) -> Iterator[Progress]:
     """One line on stderr with stage, items done, rate and time left; removed at the end.
 
-    Gives a function of stage, done and total (0: unknown; then the elapsed time is shown). Nothing is written where
-    stderr is not a terminal.
+    Gives a function of stage, done and total (0: unknown; then the elapsed time is shown). Where stderr is no terminal,
+    nothing is written, or with `notebook` one line of text, which every update overwrites.
     """
-    if quiet or sys.stderr is None or not sys.stderr.isatty():
+    if quiet or sys.stderr is None or not (notebook or sys.stderr.isatty()):
         yield silent
+        return
+    if not sys.stderr.isatty():
+        line = _PlainLine()
+        yield line
+        line.clear()
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"))
     with Bar(*columns, console=Console(file=sys.stderr), transient=True, refresh_per_second=1 / PERIOD_S) as bar:
         yield _Line(bar, bar.add_task("", total=None, visible=False, status=""))
+
+
+class _PlainLine:
+    """The line of the current stage as text, for what understands no escapes of a terminal."""
+
+    def __init__(self) -> None:
+        self._stage, self._begun, self._drawn, self._width = "", 0.0, 0.0, 0
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        now = time.perf_counter()
+        if stage != self._stage:
+            self._stage, self._begun = stage, now
+        elif now - self._drawn < PLAIN_PERIOD_S and done < total:
+            return
+        self._drawn = now
+        self._write(f"{stage}: {_Status(done, total, self._begun)}")
+
+    def clear(self) -> None:
+        """Remove the line."""
+        self._write("")
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(f"\r{text:<{self._width}}" if text else f"\r{'':<{self._width}}\r")
+        sys.stderr.flush()
+        self._width = len(text)
 
 
 class _Line:
