@@ -19,8 +19,8 @@ def example(kind: type[Stream], n: int = 6, *, optional: bool = True, geodetic: 
         shape = (n,) if len(spec.metadata["columns"]) == 1 else (n, len(spec.metadata["columns"]))
         if spec.name == "t_ns":
             values["t_ns"] = 1_748_772_000_123_456_789 + np.arange(n) * 10_000_001
-        elif spec.name == "arrival_ns":
-            values["arrival_ns"] = values["t_ns"] + rng.integers(0, 2**40, shape)
+        elif spec.name in ("arrival_ns", "t_end_ns"):
+            values[spec.name] = values["t_ns"] + rng.integers(0, 2**40, shape)
         elif spec.metadata["kind"] == "float":
             values[spec.name] = rng.uniform(0.1, 1.0, shape)  # 53 random bits
         elif spec.metadata["kind"] == "int":

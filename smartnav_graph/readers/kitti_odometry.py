@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.core.arrays import Table, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import CalibrationError, SessionError
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.reference import pose_columns
 from smartnav_graph.readers.source import Reader, build_session, mount, only_folder
@@ -86,10 +86,16 @@ def _camera(path: Path, picture: Path) -> Camera:
     try:
         P = np.array(cells, dtype=np.float64).reshape(3, 4)
     except ValueError as error:
-        raise SessionError(path, f"the first row is no matrix ({error})", "12 numbers, perhaps after P0:") from error
+        raise SessionError(path, f"row 0 is no matrix ({error})", "12 numbers, perhaps after P0:", row=0) from error
+    if P[0, 1] or P[1, 0] or P[2].tolist() != [0.0, 0.0, 1.0, 0.0]:
+        found = f"row 0 is {' '.join(cells)}: no projection of rectified pictures"
+        raise SessionError(path, found[:400], "fx 0 cx x, 0 fy cy y, 0 0 1 0", "copy the file again", row=0)
     width, height = _size(picture)
     fx, fy, cx, cy = (float(P[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Camera(width, height, fx, fy, cx, cy)
+    try:
+        return Camera(width, height, fx, fy, cx, cy)
+    except CalibrationError as error:
+        raise SessionError(path, f"row 0: {error.found}", error.expected, "copy the file again", row=0) from error
 
 
 def _size(picture: Path) -> tuple[int, int]:

@@ -111,6 +111,16 @@ class StaticPeriod(Stream):
     sigma_v: Floats | None = quantity("sigma_v_m_s", optional=True)
     source: Texts | None = quantity("source", optional=True, kind="text")
 
+    def _check_rows(self) -> None:
+        super()._check_rows()
+        length = self.t_end_ns.astype(np.float64) - self.t_ns
+        bad = np.flatnonzero(~((length >= 0) & (length <= LONGEST_GAP_NS)))
+        if len(bad):
+            row = int(bad[0])
+            found = f"t_end_ns lies {length[row] / NS:.6g} s after t_ns at row {row} ({len(bad)} such rows in all)"
+            rule = f"0 to {LONGEST_GAP_NS / NS / 86400:g} days"
+            raise self._error(found, rule, "correct the stamps or their unit, or leave the row out", row)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Magnetometer(Stream):

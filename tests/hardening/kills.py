@@ -21,6 +21,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from smartnav_graph.session import folder as sessions
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "open", "shutil.rmtree", "shutil.copyfile", "ctypes.dlsym")
 SIGNALS = {"KILL": signal.SIGKILL, "TERM": signal.SIGTERM, "INT": signal.SIGINT}
 ALLOWED = {"KILL": (-9,), "TERM": (143,), "INT": (130,)}
+NOT_BEGUN = 71
 LONGEST_S = 120.0
 
 
@@ -86,6 +88,7 @@ def child(arguments: list[str], stop: tuple[str, int] | None, report: Path) -> i
 
     code = 70
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored in a process in the background
         out = os.open(report, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(out, 1)
         os.dup2(out, 2)
@@ -93,8 +96,12 @@ def child(arguments: list[str], stop: tuple[str, int] | None, report: Path) -> i
         code = main(arguments)
         if stop is None:
             sys.stderr.write(f"\nevents {count}\n")
-    except BaseException as error:
-        sys.stderr.write(f"Traceback {error!r}\n")
+    except KeyboardInterrupt as error:
+        code = 70 if "main" in {frame.name for frame in traceback.extract_tb(error.__traceback__)} else NOT_BEGUN
+        if code == 70:
+            traceback.print_exc()
+    except BaseException:
+        traceback.print_exc()
     finally:
         sys.stderr.flush()
         os._exit(code)
@@ -187,12 +194,13 @@ def strike(folder: Path, name: str, kind: str, rng: random.Random) -> list[str]:
     code, seconds = ended(child(command.line(out), stop, folder / "report"), when if timed else None, kind)
     where = f"{name} {kind} at {when:.3g} {'s' if timed else f'of {command.events} changes'}"
     text = (folder / "report").read_text()
-    faults = [] if code in (0, 3, *ALLOWED[kind]) else [f"exit code {code}: {text[-500:]}"]
+    there = content(out)
+    before_it_began = code in (NOT_BEGUN, -SIGNALS[kind]) and there == command.old  # before signals are caught
+    faults = [] if code in (0, 3, *ALLOWED[kind]) or before_it_began else [f"exit code {code}: {text[-500:]}"]
     if "Traceback" in text:
         faults.append(text[-800:])
     if seconds > 0.9 * LONGEST_S:
         faults.append(f"took {seconds:.0f} s")
-    there = content(out)
     names = frozenset(file for file, _ in there)
     new = names >= command.names and there != command.old
     if name == "match":  # one more file in a session

@@ -30,8 +30,11 @@ import numpy as np
 import pandas as pd
 import tomli_w
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "readers" / "apps"))
-from exports import EXPORTS
+READERS = Path(__file__).parents[1] / "readers"
+sys.path[:0] = map(str, (READERS, READERS / "apps"))
+from test_mutants import EXPORTS
+
+import cv2
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SmartnavError
@@ -44,6 +47,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.simulation import scenarios
 
+AS_WRITTEN = ("config", "calibration")  # any value inside of its rule is as good as another
 LONGEST_S, LARGEST_KB = 90, 2_000_000
 PLACE = re.compile(
     r"\brow \d|line \d|record \d|at byte|column|key |\w = |\w\[\d|variable|\w+_(m|s|ns|deg|ut|hpa)\b|stamp"
@@ -136,6 +140,21 @@ def foot(path: Path) -> Path:
     return path / "foot.mat"
 
 
+def kitti(path: Path) -> Path:
+    """20 pictures of an odometry sequence, a metre ahead from one to the next, which turns to the right."""
+    root, count = path / "sequence", 20
+    (root / "image_0").mkdir(parents=True)
+    for i in range(count):
+        cv2.imwrite(str(root / "image_0" / f"{i:06d}.png"), np.full((8, 12), 100 + i, np.uint8))
+    angle = 0.05 * np.arange(count)
+    c, s, x, z = np.cos(angle), np.sin(angle), np.cumsum(np.sin(angle)), np.cumsum(np.cos(angle))
+    poses = [f"{c[i]:.9f} 0 {s[i]:.9f} {x[i]:.6f} 0 1 0 0 {-s[i]:.9f} 0 {c[i]:.9f} {z[i]:.6f}" for i in range(count)]
+    (root / "poses.txt").write_text("\n".join(poses) + "\n")
+    (root / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(count)))
+    (root / "calib.txt").write_text("P0: 7.0e+02 0 6.0 0 0 7.1e+02 4.0 0 0 0 1 0\nP1: 7e+02 0 6 -386 0 7e+02 4 0 0 0 1 0\n")
+    return root
+
+
 def exported(name: str) -> Callable[[Path], Path]:
     file, write = EXPORTS[name]
     return lambda path: Path(write(path / file))
@@ -143,25 +162,46 @@ def exported(name: str) -> Callable[[Path], Path]:
 
 def read_session(path: Path) -> object:
     found = readers.load(path)
-    texts = [str(finding) for finding in health.inspect(found).findings]
+    camera = repr(found.calibration.cameras) if found.calibration is not None else ""
+    checked = health.inspect(found)
+    texts = [str(finding) for finding in checked.findings]
     tables = {name: pd.DataFrame(stream.columns()).astype(str) for name, stream in found.streams().items()}
     rows = {name: int(pd.util.hash_pandas_object(table).sum() % 2**53) for name, table in tables.items()}
-    return rows, [*texts, *(f"{k} {v}" for k, v in found.dropped.items())]
+    texts += [f"there is no {part}" for part in checked.missing]
+    return [rows, camera], [*texts, *(f"{k} {v}" for k, v in found.dropped.items())]
+
+
+def read_toml_of(load: Callable[[Path], object], text: Callable[[object], str]) -> Callable[[Path], object]:
+    """What is read, and the keys that are read with another value than the file has."""
+
+    def read(path: Path) -> object:
+        found = load(path)
+        return repr(found), [f"read as {key}" for key in unlike(tomllib.loads(path.read_text()), tomllib.loads(text(found)))]
+
+    return read
+
+
+def unlike(wanted: object, found: object, where: str = "") -> list[str]:
+    """Keys whose value is another one; those that `wanted` does not have take their default."""
+    if isinstance(wanted, dict) and isinstance(found, dict):
+        return [key for name in wanted for key in unlike(wanted[name], found.get(name), f"{where}.{name}")]
+    return [] if wanted == found or wanted != wanted else [f"{where} = {found}"]
 
 
 BASES: dict[str, Base] = {
     "session": Base(write_session, read_session),
     "csv": Base(write_csv, read_session),
     "config": Base(
-        text_base("config.toml", lambda: config.dumps(config.Config())), lambda p: (repr(config.load(p)), [])
+        text_base("config.toml", lambda: config.dumps(config.Config())), read_toml_of(config.load, config.dumps)
     ),
     "calibration": Base(
         text_base("calibration.toml", lambda: model.calibration_toml(short_session().calibration)),
-        lambda p: (repr(model.load_calibration(p)), []),
+        read_toml_of(model.load_calibration, model.calibration_toml),
     ),
     "tum": Base(text_base("truth.tum", tum), lambda p: (repr(load_reference(p)), [])),
     "comma2k19": Base(comma, read_session),
     "foot": Base(foot, read_session),
+    "kitti-odometry": Base(kitti, read_session),
     **{name: Base(exported(name), read_session) for name in EXPORTS},
 }
 
@@ -254,6 +294,17 @@ def mutate(file: Path, rng: random.Random) -> bool:
     return True
 
 
+def holds(source: Path, file: Path) -> bool:
+    """Whether a session has the readings of a Parquet file of its own: any in their range are as good as others."""
+    found = pd.DataFrame(readers.load(source).streams()[file.stem].columns())
+    written = pd.read_parquet(file).reset_index(drop=True)
+    return set(found) == set(written) and bool(np.all([_same(found[name], written[name]) for name in found]))
+
+
+def _same(first: pd.Series, second: pd.Series) -> bool:
+    return bool(((first == second) | (first.isna() & second.isna())).all())
+
+
 def in_a_child(work: Callable[[], object], folder: Path) -> tuple[str, object, float, int]:
     """How reading ended (read, refused, traceback, killed), what it gave, seconds, kB."""
     begin, answer = time.perf_counter(), folder / "answer.json"
@@ -304,10 +355,14 @@ def judge(folder: Path, name: str, seed: int, counts: Counter[str]) -> list[str]
         counts["refused, place named"] += placed and bool(PLACE.search(text))
         if placed and not PLACE.search(text):
             counts[f"no place: {text[:160]}"] += 1
-    if how == "read" and changed and placed and what[0] != with_base[0] and what[1] == with_base[1]:
-        counts["read, other than its base, not reported"] += 1
+    if how == "read" and changed and name in AS_WRITTEN:
+        faults += [f"another value than in the file: {text}" for text in what[1]]
+    elif how == "read" and changed and file.suffix == ".parquet" and file.exists() and holds(source, file):
+        counts["read as written"] += 1
+    elif how == "read" and changed and what[0] != with_base[0] and what[1] == with_base[1]:
         if not (log.exists() and log.read_text()):
-            counts[f"silent: {where}"] += 1
+            counts["read, other than its base, not reported"] += 1
+            counts[f"silent{'' if placed else ', bytes'}: {where}"] += 1
     return [f"{where}: {fault}" for fault in faults]
 
 

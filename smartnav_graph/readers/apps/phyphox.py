@@ -89,14 +89,14 @@ def _start_ns(about: Mapping[str, TextTable]) -> int | None:
     if table is None:
         return None
     names = {quantity_in(name): name for name in table.cells}
-    if not {"experimenttime", "systemtime"} <= set(names):
+    if not {"event", "experimenttime", "systemtime"} <= set(names) or not len(table):
         return None
-    texts = [table.texts(names[quantity])[0].replace(",", ".") for quantity in ("systemtime", "experimenttime")]
+    event, *texts = (table.texts(names[quantity])[0] for quantity in ("event", "systemtime", "experimenttime"))
     try:
-        system, experiment = (ns_from_text(text) for text in texts)
+        system, experiment = (ns_from_text(text.replace(",", ".")) for text in texts)
     except SessionError:
         return None
-    return system - experiment
+    return system if event.strip().upper() == "START" and experiment == 0 else None
 
 
 def _device(about: Mapping[str, TextTable]) -> str:
@@ -114,6 +114,11 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     tables, about = _tables(path)
     start_ns = _start_ns(about)
     parts, vectors = LogParts(), dict[str, Samples]()
+    if "time" in about and start_ns is None:
+        parts.count("clock", {"START with its Unix time missing in meta/time.csv; stamps are since the start": 1})
+    if path.is_dir():
+        left_out = [name for name in _files(path) if name not in tables]
+        parts.count("session", {f"table {name}, which has no known quantity, left out": 1 for name in left_out})
     for name, table in tables.items():
         if not _is_ours(list(table.cells)) or not len(table):
             continue

@@ -86,6 +86,9 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if "Barometer" in tables and "pressure" in tables["Barometer"].cells:
         table = tables["Barometer"]
         parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
+    for name, table in tables.items():
+        if not name.startswith("Location") and not {"x", "y", "z"} <= set(table.cells) and "pressure" not in table.cells:
+            parts.count("session", {f"of {name} left out: no columns x, y, z or pressure": len(table)})
     location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
     fixes = None if location is None else replace(_fixes(location), above_sea=_is_ios(about))
     if location is not None and fixes is not None:

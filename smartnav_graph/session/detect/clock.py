@@ -32,6 +32,7 @@ _OVERLAP_S = 10.0  # of both sensors, at least
 _WINDOWS = ((20.0, 3), (40.0, 5))  # length, s, and degree of the polynomial
 SPACING_S = 0.95  # between fixes that are used
 _COARSE_S, _FINE_S = 0.25, 0.02
+_MOST_LAGS = 1_000_000  # two days; fixes of longer are not compared
 _LONG_SEARCH_S = 3600.0  # more lags than that in steps twice as long
 _MOST_FIXES = 600  # of the search; the refinement takes all
 _LONG_CHORD_S, _BLOCK_S = 4.0, 60.0
@@ -218,6 +219,8 @@ def find_clock_offset(sensor: str, motion: InertialMotion, fixes: FixTrack) -> C
     if first >= last:
         return None
     step = _COARSE_S if last - first < _LONG_SEARCH_S else 2.0 * _COARSE_S
+    if last - first > step * _MOST_LAGS:
+        return None
     lags = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
     course = course_score(motion, part, lags)
     shape = shape_score(motion, part, lags)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from smartnav_graph.core.arrays import Floats, Mask, Times, runs
+from smartnav_graph.core.arrays import Floats, Indices, Mask, Times, runs
 from smartnav_graph.core.timebase import NS, Gap, interpolate
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
@@ -20,6 +20,7 @@ CHORD_S = 4.0  # s between the fixes of a speed
 _SPEEDS = {3.6: "km/h", 1.944: "knots", 2.237: "mph", 3.281: "ft/s", 100.0: "cm/s", 1000.0: "mm/s"}
 _NEAR = 0.06  # of a unit's factor
 _TOGETHER = 50  # rows that may arrive together
+_SPIKE_ROWS = 200
 _ODD = 1.3  # a factor that slip or tyres do not explain
 
 
@@ -144,6 +145,21 @@ def repeats(values: Floats) -> list[tuple[int, int]]:
     """First and last row of every stretch in which a signal (n,) or (n, k) repeats itself exactly."""
     rows = values.reshape(len(values), -1)
     return [(int(i), int(j)) for i, j in runs((rows[1:] == rows[:-1]).all(axis=1))]
+
+
+def spike_rows(values: Floats, least: float) -> Indices:
+    """Rows of a signal (n, k) that differ from their four neighbours by more than twenty times what 99 of 100 readings
+    do, and by more than `least`, what a device can do from one sample to the next and back."""
+    if len(values) < _SPIKE_ROWS:
+        return np.zeros(0, dtype=np.int64)
+    a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
+    lower, upper = np.minimum(a, b), np.minimum(c, d)
+    high, low = np.maximum(a, b), np.maximum(c, d)
+    least_of, most_of = np.minimum(lower, upper), np.maximum(high, low)
+    median = 0.5 * (np.maximum(lower, upper) + np.minimum(high, low))
+    apart = np.abs(values[2:-2] - median).max(axis=1)
+    limit = max(least, 20.0 * float(np.quantile(apart, 0.99)))
+    return np.asarray(2 + np.flatnonzero((apart > limit) & (apart > 5.0 * (most_of - least_of).max(axis=1))))
 
 
 def count_of(n: int, noun: str, plural: str = "s") -> str:

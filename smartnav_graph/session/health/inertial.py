@@ -22,6 +22,7 @@ from smartnav_graph.session.health.facts import (
     over_chords,
     period,
     repeats,
+    spike_rows,
 )
 from smartnav_graph.session.streams import Imu
 
@@ -31,7 +32,6 @@ _TILTED = 5.0  # deg that gravity may end off within 2 s
 _MAX_RATE = 35.0  # rad/s = 2000 deg/s, where consumer gyroscopes saturate
 _MAX_RMS_RATE = 10.0  # rad/s; a phone shaken by hand reaches 5
 _SPIKES = {"accel": 80.0, "gyro": 20.0}  # m/s^2, rad/s
-_SPIKE_ROWS = 200
 _FROZEN_S = 1.0  # six axes never repeat for so long
 _CLEAR_TURN = 0.4  # rad in some seconds
 _CORRELATED = 0.7  # correlation beyond chance
@@ -227,24 +227,9 @@ def _spikes(facts: Facts) -> Iterator[Finding]:
 
 
 def spikes(imu: Imu) -> dict[str, Indices]:
-    """Rows of single readings of accel and gyro that differ from their four neighbours by more than twenty times what
-    99 of 100 readings do, and by more than a device can do from one sample to the next and back."""
-    found = {}
-    for name, least in _SPIKES.items():
-        values = getattr(imu, name)
-        if len(values) < _SPIKE_ROWS:
-            return {}
-        a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
-        lower, upper = np.minimum(a, b), np.minimum(c, d)
-        high, low = np.maximum(a, b), np.maximum(c, d)
-        least_of, most_of = np.minimum(lower, upper), np.maximum(high, low)
-        median = 0.5 * (np.maximum(lower, upper) + np.minimum(high, low))
-        apart = np.abs(values[2:-2] - median).max(axis=1)
-        limit = max(least, 20.0 * float(np.quantile(apart, 0.99)))
-        rows = 2 + np.flatnonzero((apart > limit) & (apart > 5.0 * (most_of - least_of).max(axis=1)))
-        if len(rows):
-            found[name] = rows
-    return found
+    """Rows of single readings of accel and gyro that are spikes (`spike_rows`)."""
+    found = {name: spike_rows(getattr(imu, name), least) for name, least in _SPIKES.items()}
+    return {name: rows for name, rows in found.items() if len(rows)}
 
 
 def _clipped(facts: Facts) -> Iterator[Finding]:

@@ -22,6 +22,7 @@ from smartnav_graph.session.health.facts import (
     over_chords,
     period,
     repeats,
+    spike_rows,
 )
 
 _EARTH_UT = (22.0, 67.0)  # of the geomagnetic field at the ground
@@ -29,6 +30,12 @@ _FIELD_UNITS = {1e-6: "tesla", 1e-3: "millitesla", 1e-2: "gauss", 1e1: "milligau
 _PRESSURE_UNITS = {100.0: "Pa", 0.1: "kPa", 0.02953: "inHg", 0.750: "mmHg", 0.0145: "psi", 0.000987: "atm"}
 _PRESSURE_HPA = (300.0, 1100.0)
 _WEATHER = 0.06  # share of the pressure
+_SPIKES = (  # what a reading may differ from its neighbours, for one row
+    ("magnetometer", "field_ut", 20.0),
+    ("barometer", "pressure_hpa", 2.0),
+    ("temperature", "temperature_c", 5.0),
+    ("wheel", "speed", 5.0),
+)
 _MAX_SPEED = 100.0  # m/s
 _FROZEN_FIELD_S = 10.0
 _TURN_S = 0.5
@@ -79,7 +86,7 @@ def _turning_field(facts: Facts) -> float | None:
     stream = stream.take((stream.t_ns >= imu.t_ns[0]) & (stream.t_ns <= imu.t_ns[-1]))
     if len(stream) < LEAST_ROWS:
         return None
-    every = max(1, round(_TURN_S / period(stream)))
+    every = min(max(1, round(_TURN_S / period(stream))), len(stream))
     field, t_ns = uniform_filter1d(stream.field_ut, every, axis=0)[::every], stream.t_ns[::every]
     angle = np.cumsum(imu.gyro * np.diff(imu.t_ns, prepend=imu.t_ns[0])[:, None] / NS, axis=0)
     half = round(0.5 * every * period(stream) * NS)
@@ -123,7 +130,7 @@ def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
     """Changes of the field over a second against those predicted from gyro, B(t + dt) = Exp(-w dt) B(t)."""
     imu = facts.imu
     assert imu is not None
-    every = max(1, round(NS / float(np.median(np.diff(t_ns)))))
+    every = min(max(1, round(NS / float(np.median(np.diff(t_ns))))), len(t_ns))
     field, t_ns = uniform_filter1d(field, every, axis=0)[::every], t_ns[::every]
     length = (t_ns[1:] - t_ns[:-1]) / NS
     whole = length < 2.0
@@ -174,6 +181,21 @@ def _temperature(facts: Facts) -> Iterator[Finding]:
     if not -60.0 < median < 110.0:
         looks = ": it looks like kelvin" if 230.0 < median < 370.0 else ""
         yield Finding("temperature", f"median {median:.4g} deg C{looks}", "give degrees Celsius")
+
+
+def _spikes(facts: Facts) -> Iterator[Finding]:
+    """Single readings far from those before and after, which no motion and no weather leaves as they are."""
+    for name, field, least in _SPIKES:
+        stream = getattr(facts.session, name)
+        if stream is None:
+            continue
+        values = getattr(stream, field).reshape(len(stream), -1)
+        rows = spike_rows(values, least)
+        if len(rows):
+            row, count = int(rows[0]), count_of(len(rows), "single reading")
+            at, reading = float(facts.session.seconds(stream.t_ns[row])), " ".join(f"{x:.6g}" for x in values[row])
+            text = f"{count} of {field} far from its neighbours, the first {reading} at row {row}, {at:.3f} s"
+            yield Finding(name, text, "correct it, or leave the row out", verdict="good")
 
 
 def _speeds(facts: Facts) -> Iterator[Finding]:
@@ -239,4 +261,4 @@ def _pictures(facts: Facts) -> Iterator[Finding]:
         yield Finding("images", text, remedy, "info" if done else "warning", verdict="good")
 
 
-RULES = (_field, _pressure, _temperature, _speeds, _standstills, _pictures)
+RULES = (_field, _pressure, _temperature, _spikes, _speeds, _standstills, _pictures)

@@ -15,6 +15,7 @@ from smartnav_graph.session.streams import ABSOLUTE, StaticPeriod
 _MOST_RATE_HZ = 8000.0  # of an IMU that people have
 _UNITS = {"microseconds": 3, "milliseconds": 6, "seconds": 9}
 _SLOW_HZ = 20.0
+_LONGEST_DAYS = 2.0  # of a recording with less than one inertial sample a second
 _UNIX_FROM, _UNIX_TO = 631_152_000 * NS, 4_102_444_800 * NS  # 1990 to 2100
 
 
@@ -56,6 +57,9 @@ def stamps(facts: Facts) -> Iterator[Finding]:
         remedy = f"multiply t_ns of every stream by 1e{fits[0][1]}" if fits else "give t_ns in nanoseconds"
         text = f"{len(imu)} stamps of t_ns lie {step:.4g} ns apart on the mean{looks}"
         yield Finding("imu", text, remedy, "error")
+    elif step > NS and (days := step * len(imu) / NS / 86400) > _LONGEST_DAYS:
+        text = f"{len(imu)} rows in {days:.4g} days: {step / NS:.4g} s from one to the next on the mean"
+        yield Finding("imu", text, "check the unit of t_ns, or cut the recording where it has long gaps", "error")
     elif arrives_in_bursts(imu.t_ns):
         short = float(np.median(np.diff(imu.t_ns)))
         text = f"rows arrive in bursts: the median step is {short / 1e3:.3g} us, the mean {step / 1e6:.4g} ms"
