@@ -32,7 +32,6 @@ from smartnav_graph.readers.text_lines import (
 )
 
 _log = logging.getLogger(__name__)
-_NO_TEXT = re.compile("[\\x00-\\x08\\x0e-\\x1f\\x7f-\\x9f\\ufffd]")  # also what is left of bytes that are no UTF-8
 _COMMA, _POINT = r"^[-+]?\d*,\d+([eE][-+]?\d+)?$", r"^[-+]?\d*\.\d+([eE][-+]?\d+)?$"
 
 BLOCK = 32 << 20  # bytes that are parsed at once; of a longer file one column at a time is held as text
@@ -258,8 +257,6 @@ def read_text(path: Path, *, names: Sequence[str] | None = None, comments: str =
         raise SessionError(path, "has no rows", "at least one row", "delete the file if there was no such sensor")
     if names is None and _ends_empty(start[0], rows.separator, len(columns)):
         columns.append(f"column {len(columns) + 1}")
-    if damaged := sum(_NO_TEXT.search(name) is not None for name in columns):
-        rows.skipped["column name damaged"] = damaged
     cells = _Cells(path, tuple(columns), rows)
     long = len(start) > 2 or sum(map(len, start)) >= BLOCK
     table = TextTable(path, cells if long else cells.parse(columns, start), rows.skipped)

@@ -14,6 +14,7 @@ HEAD_BYTES = 1 << 16
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _UTF8 = b"\xef\xbb\xbf"
 _SEPARATORS = ",;\t|"
+_NO_TEXT = re.compile("[\x00-\x08\x0e-\x1f\x7f-\x9f\ufffd]")  # also what is left of bytes that are no UTF-8
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class TextRows:
         any last row without line end: its last number may be cut.
         """
         self.skipped.clear()
+        self._skip("line with column names damaged", int(_NO_TEXT.search(self.heading.decode("utf-8", "replace")) is not None))
         before = b""
         for i, lines in enumerate(self.read()):
             block = in_utf8(lines)

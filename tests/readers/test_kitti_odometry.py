@@ -70,7 +70,7 @@ def test_pictures_in_an_archive_are_reported(folder):
 @pytest.mark.parametrize(
     ("file", "text", "parts"),
     [
-        ("calib.txt", "1 2 3\n", ("calib.txt: the first row is no matrix", "12 numbers")),
+        ("calib.txt", "1 2 3\n", ("calib.txt: row 0 is no matrix", "12 numbers")),
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", ("poses.txt: has 1 rows; expected 2, one per picture",)),
         ("poses.txt", POSES.replace("0 0 1 0.5", "0 0 2 0.5"), ("3x3 part of row 1 is no rotation",)),
         ("times.txt", "0.0\nx\n", ("times.txt: t is 'x' at row 1",)),
@@ -89,4 +89,13 @@ def test_no_pictures(folder):
     for file in (folder / "image_0").iterdir():
         file.unlink()
     with pytest.raises(SessionError, match="image_0: holds no pictures"):
+        readers.read(folder)
+
+
+@pytest.mark.parametrize(
+    "row", ["P0: nan 0 6 0 0 7e2 4 0 0 0 1 0", "P0: -7 0 6 0 0 7e2 4 0 0 0 1 0", "P0: 7e2 1 6 0 0 7e2 4 0 0 0 1 0", "P1: 1"]
+)
+def test_a_camera_that_is_none_is_named_with_its_row(folder, row):
+    (folder / "calib.txt").write_text(row + "\n")
+    with pytest.raises(SessionError, match=r"calib\.txt: row 0.*; expected "):
         readers.read(folder)

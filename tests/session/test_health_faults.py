@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.frames import Origin, axis_vector
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.health import inspect
@@ -142,6 +144,17 @@ def repeated_fixes(session: Session) -> Session:
     return session.replace(gnss=replace(session.gnss, lla=session.gnss.lla[np.arange(len(session.gnss)) // 5 * 5]))
 
 
+def spike(stream: str, column: str, reading: float):
+    """One reading that is another, those before and after are not."""
+
+    def fault(session: Session) -> Session:
+        values = np.array(getattr(getattr(session, stream), column))
+        values[300] = reading
+        return changed(session, stream, **{column: values})
+
+    return fault
+
+
 CAR, WALK = "car-all-2min", "walk-all-2min"
 FAULTS = [
     ("car-10min", scaled("imu", "gyro", -1.0), "imu: gyro turns against", "flip the sign of gyro"),
@@ -189,6 +202,9 @@ FAULTS = [
     (WALK, inverse_quaternion, "if read inverted", "give qw, qx, qy, qz"),
     (WALK, north_east_down, "they look like north, east, down", "east, north, up"),
     (CAR, moving_standstill, "static: the device moves in 1 listed standstill of 1", "check their stamps"),
+    (CAR, spike("barometer", "pressure_hpa", 700.0), "barometer: 1 single reading of pressure_hpa", "leave the row out"),
+    (CAR, spike("magnetometer", "field_ut", 90.0), "first 90 90 90 at row 300", "leave the row out"),
+    (CAR, spike("wheel", "speed", 80.0), "wheel: 1 single reading of speed", "leave the row out"),
     (CAR, kelvin, "it looks like kelvin", "degrees Celsius"),
 ]
 
@@ -223,3 +239,27 @@ def test_sound_sessions_elsewhere_raise_no_alarm(lat, lon):
     for name, places in enu.items():
         moved = changed(moved, name, lla=moved.frame.lla_from_nav(places))
     assert warnings_of(moved) == []
+
+
+def test_stamps_of_another_unit_in_one_stream_cost_no_memory():
+    """Magnetometer rows 1 ns apart, fixes over years: checked at once, whatever span their stamps have."""
+    session = sound(CAR, seed=1)
+    near = session.t0_ns + 60 * NS + np.arange(len(session.magnetometer))
+    far = session.t0_ns + np.arange(len(session.gnss)) * 86_400 * NS
+    begin = time.perf_counter()
+    inspect(changed(changed(session, "magnetometer", t_ns=near), "gnss", t_ns=far))
+    assert time.perf_counter() - begin < 20.0  # s
+
+
+def test_inertial_rows_over_years_are_no_recording():
+    session = sound(CAR, seed=1)
+    rows = session.imu.take(slice(0, 60))
+    found = warnings_of(Session(imu=replace(rows, t_ns=np.arange(60) * 29 * 86_400 * NS)))
+    assert any("60 rows in 1740 days" in text for text in found)
+
+
+@pytest.mark.parametrize(("begin", "end"), [(5, 4), (0, 31 * 86_400)])
+def test_a_standstill_ends_after_it_begins_and_within_the_recording(begin, end):
+    StaticPeriod(t_ns=[begin * NS], t_end_ns=[begin * NS])
+    with pytest.raises(SessionError, match="t_end_ns lies .* at row 0 .*; expected 0 to 30 days; correct the stamps"):
+        StaticPeriod(t_ns=[begin * NS], t_end_ns=[end * NS])

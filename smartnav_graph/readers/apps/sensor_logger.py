@@ -140,7 +140,8 @@ def _of_combined(path: Path) -> dict[str, TextTable]:
 
 
 def _has_rows(file: Path) -> bool:
-    return len(head_of(file).strip().splitlines()) > 1
+    """Whether a file is more than a heading; also where it is no text, which `read_text` says."""
+    return not (head := head_of(file)) or len(head.strip().splitlines()) > 1
 
 
 def _small_letters(table: TextTable) -> TextTable:

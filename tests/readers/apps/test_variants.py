@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from exports import ACCEL, FIXES, GYRO, UNIX, androsensor, lat, sensor_logger, sensorlog, times
+from exports import ACCEL, FIXES, GYRO, UNIX, androsensor, lat, phyphox, sensor_logger, sensorlog, times
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
@@ -131,3 +131,31 @@ def test_without_metadata_the_system_is_guessed_and_said(tmp_path, warned):
     (folder / "Metadata.csv").unlink()
     check(readers.read(folder))
     assert "no Metadata: taken as of iOS (opposite sign): a phone mostly lies on its back" in warned()
+
+
+def test_tables_and_columns_that_are_not_read_are_said(tmp_path):
+    folder = sensor_logger(tmp_path / "drive")
+    for name, old, new in (("Barometer", "pressure", "p"), ("Location", "speedAccuracy", "sp\x01y")):
+        file = folder / f"{name}.csv"
+        file.write_text(file.read_text().replace(old, new))
+    session = readers.read(folder)
+    assert session.dropped["session"] == {"of Barometer left out: no columns x, y, z or pressure": 2}
+    assert session.dropped["gnss"] == {"line with column names damaged": 1} and session.barometer is None
+    assert "session" not in readers.read(sensor_logger(tmp_path / "whole")).dropped
+    file.write_bytes(file.read_bytes().replace(b"\x01", b"\0"))
+    with pytest.raises(SessionError, match=r"Location\.csv: is no text"):
+        readers.read(folder)
+
+
+@pytest.mark.parametrize(
+    "row", ['"PAUSE",0.0,1700000000.5,x', '"START",5.0,1700000000.5,x', '"START",1e300,1700000000.5,x']
+)
+def test_a_phyphox_log_without_the_time_of_its_start_says_so(tmp_path, row):
+    folder = phyphox(tmp_path / "walk")
+    assert readers.read(folder).clock_epoch == "unix" and "clock" not in readers.read(folder).dropped
+    file = folder / "meta" / "time.csv"
+    file.write_text(f"{file.read_text().splitlines()[0]}\n{row}\n")
+    (folder / "Gyroscope uncalibrated.csv").write_text("a,b\n1,2\n3,4\n")
+    session = readers.read(folder)
+    assert session.clock_epoch == "unknown" and sum(session.dropped["clock"].values()) == 1
+    assert session.dropped["session"] == {"table Gyroscope uncalibrated, which has no known quantity, left out": 1}
