@@ -31,7 +31,8 @@ import numpy as np
 import pandas as pd
 import tomli_w
 
-sys.path[:0] = [str(Path(__file__).parents[1] / "readers" / folder) for folder in (".", "apps")]
+sys.path.insert(0, str(Path(__file__).parents[1] / "readers" / "apps"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from test_mutants import EXPORTS
 
 from smartnav_graph import readers
@@ -312,6 +313,7 @@ def in_a_child(work: Callable[[], object], folder: Path) -> tuple[str, object, f
             signal.alarm(LONGEST_S)
             resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
             logging.basicConfig(filename=folder / "log.txt", force=True)
+            logging.captureWarnings(True)
             try:
                 found = ["read", work()]
             except SmartnavError as error:
