@@ -111,8 +111,14 @@ class Export(Writing):
 
     run_path: RunPath
     """Run folder; for smartnav a session."""
-    format: Literal["tum", "kml", "geojson", "gpx", "csv", "images", "smartnav"]
-    """The format; kml, geojson, gpx and images need an origin. smartnav: the files of the logger of 2012."""
+    format: Annotated[
+        Literal["tum", "kml", "geojson", "gpx", "csv", "sbet", "nmea", "gpkg", "images", "smartnav"],
+        tyro.conf.arg(metavar="FORMAT"),
+    ]
+    """tum, kml, geojson, gpx, csv, sbet, nmea, gpkg, images, smartnav (the files of the logger of 2012). All but tum, csv
+    and smartnav need an origin, sbet and nmea a clock with dates."""
+    crs: Annotated[str | None, tyro.conf.arg(metavar="EPSG:CODE")] = None
+    """For csv and gpkg: coordinates in this system, too, such as EPSG:25832."""
     solution: Literal["smoothed", "causal"] = "smoothed"
     """Solution of a replay."""
     session: Annotated[Path | None, tyro.conf.arg(metavar="SESSION")] = None
@@ -135,7 +141,8 @@ class Export(Writing):
             return
         if self.out.is_dir():  # --force replaces an older export, not a folder
             raise SessionError(self.out, "is a folder", "the name of a file", "choose another --out")
-        export(run.named(self.solution), self.format, self.out, force=self.force, clock_epoch=run.clock_epoch)
+        solution, epoch = run.named(self.solution), run.clock_epoch
+        export(solution, self.format, self.out, force=self.force, clock_epoch=epoch, crs=self.crs)
         print(f"{self.format}: {self.out}")
 
     def _pictures(self, run: StoredRun) -> None:

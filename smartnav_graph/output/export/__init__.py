@@ -1,4 +1,5 @@
-"""A solution in the formats of other programs: TUM, KML, GeoJSON, GPX, CSV, and images with their position.
+"""A solution in the formats of other programs: TUM, KML, GeoJSON, GPX, CSV, SBET, NMEA, GeoPackage, and images with
+their position.
 
 Geographic formats need an origin. Their times are absolute only where the clock counts from the Unix epoch; otherwise
 the files have seconds since time zero. Their description says so, and that heights are ellipsoidal (WGS84): KML and
@@ -13,48 +14,72 @@ from pathlib import Path
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import replacing
 from smartnav_graph.graph.solution import Solution
+from smartnav_graph.output.export.coordinates import coordinates_in
 from smartnav_graph.output.export.geographic import write_geojson, write_gpx, write_kml
+from smartnav_graph.output.export.geopackage import write_geopackage
+from smartnav_graph.output.export.navigation import write_nmea, write_sbet
 from smartnav_graph.output.export.pictures import Geotags, export_pictures
 from smartnav_graph.output.export.plain import write_trajectory_csv, write_tum
 
 __all__ = ["FORMATS", "Geotags", "export", "export_pictures", "write_trajectory_csv"]
 
-PLAIN: dict[str, Callable[[Solution, Path], None]] = {"tum": write_tum, "csv": write_trajectory_csv}
 GEOGRAPHIC: dict[str, Callable[[Solution, Path, bool], None]] = {
     "kml": write_kml,
     "geojson": write_geojson,
     "gpx": write_gpx,
 }
-FORMATS = ("tum", "kml", "geojson", "gpx", "csv")
+DATED: dict[str, Callable[[Solution, Path, str], None]] = {"sbet": write_sbet, "nmea": write_nmea}
+FORMATS = ("tum", "kml", "geojson", "gpx", "csv", "sbet", "nmea", "gpkg")
+IN_ANY_CRS = ("csv", "gpkg")
 
 
 def export(
-    solution: Solution, format: str, path: str | Path, *, force: bool = False, clock_epoch: str = "unknown"
+    solution: Solution,
+    format: str,
+    path: str | Path,
+    *,
+    force: bool = False,
+    clock_epoch: str = "unknown",
+    crs: str | None = None,
 ) -> None:
     """Write a solution as one file, all or nothing.
 
     Parameters
     ----------
-    format : ``tum`` | ``kml`` | ``geojson`` | ``gpx`` | ``csv``
+    format : one of `FORMATS`
     force : replace an existing file
     clock_epoch : of the session; ``unix`` gives absolute times in the geographic formats
+    crs : system of the coordinates, such as ``EPSG:25832``: further columns of csv, geometry of gpkg
 
     Raises
     ------
     SessionError
-        Unknown format; a geographic one without origin; the file exists; the system refuses to write.
+        Unknown format or system; one that needs an origin or a date that the session does not have; the file exists;
+        the system refuses to write.
     """
     if format not in FORMATS:
         raise SessionError("--format", f"{format!r}", f"one of {', '.join(FORMATS)}")
-    if format in GEOGRAPHIC and solution.origin is None:
+    if crs is not None and format not in IN_ANY_CRS:
+        raise SessionError(
+            f"--crs {crs}", f"cannot be written as {format}", f"--format {' or '.join(IN_ANY_CRS)}", "leave --crs out"
+        )
+    if solution.origin is None and (format not in ("tum", "csv") or crs is not None):
         raise SessionError(
             f"--format {format}",
             "the solution has no origin, only local metres",
             "an [origin] in session.toml",
             "add lat_deg, lon_deg, height_m and smooth again, or export tum or csv",
         )
+    if format == "gpkg" and Path(path).suffix != ".gpkg":
+        raise SessionError(path, "is no name of a GeoPackage", "NAME.gpkg", "other programs would not open it")
     with replacing(path, force=force) as file:
         if format in GEOGRAPHIC:
             GEOGRAPHIC[format](solution, file, clock_epoch == "unix")
+        elif format in DATED:
+            DATED[format](solution, file, clock_epoch)
+        elif format == "gpkg":
+            write_geopackage(solution, file, clock_epoch, crs)
+        elif format == "csv":
+            write_trajectory_csv(solution, file, {} if crs is None else coordinates_in(solution, crs))
         else:
-            PLAIN[format](solution, file)
+            write_tum(solution, file)

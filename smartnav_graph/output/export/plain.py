@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.graph.solution import Solution
 
 
-def write_trajectory_csv(solution: Solution, path: str | Path) -> None:
-    """The columns of trajectory.csv: t_ns as integer, floats in the shortest text that reads back the same.
+def write_trajectory_csv(solution: Solution, path: str | Path, further: Mapping[str, Floats] | None = None) -> None:
+    """The columns of trajectory.csv and `further` ones: t_ns as integer, floats in the shortest text that reads back the same.
 
     Unknown values are empty: latitude, longitude and height without an origin. Writes directly to `path`.
     """
     import pyarrow as pa
     import pyarrow.csv
 
-    columns = solution.trajectory_columns()
+    columns = solution.trajectory_columns() | dict(further or {})
     table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
     with open(path, "wb") as file:
         file.write((",".join(columns) + "\n").encode())  # pyarrow would quote the names

@@ -324,12 +324,13 @@ def test_unknown_format(solution, tmp_path):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_nothing_existing_is_overwritten_without_force(solution, format, tmp_path):
-    (tmp_path / "a").write_text("precious")
+    path = tmp_path / f"a.{format}"
+    path.write_text("precious")
     with pytest.raises(SessionError, match="exists already"):
-        export(solution, format, tmp_path / "a")
-    assert (tmp_path / "a").read_text() == "precious"
-    export(solution, format, tmp_path / "a", force=True)
-    assert (tmp_path / "a").read_text() != "precious"
+        export(solution, format, path)
+    assert path.read_text() == "precious"
+    export(solution, format, path, force=True, clock_epoch="unix")
+    assert path.read_bytes() != b"precious"
 
 
 @pytest.mark.parametrize("format", ["kml", "gpx", "geojson"])
