@@ -5,8 +5,8 @@ latitude and longitude rad, ellipsoidal height m; velocity m/s north, east, down
 pitch, heading rad; wander angle; acceleration m/s^2 with gravity removed, and angular rate rad/s, forward, right, down
 (zero where the run holds no inertial data).
 
-NMEA: GGA of quality 6 (estimated), RMC, GST, and THS (true heading). Heights are ellipsoidal, with a geoid separation of
-zero, unless the height of the geoid is given.
+NMEA: GGA of quality 6 (estimated), RMC, GST, and THS (true heading). Heights are ellipsoidal, and the geoid separation
+is zero.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from smartnav_graph.graph.solution import Solution
 
 
 def write_trajectory_csv(solution: Solution, path: str | Path, further: Mapping[str, Floats] | None = None) -> None:
-    """The columns of trajectory.csv and `further` ones: t_ns as integer, floats in the shortest text that reads back the same.
+    """The columns of trajectory.csv and `further` ones: t_ns as integer, floats in the shortest text that reads back
+    the same.
 
     Unknown values are empty: latitude, longitude and height without an origin. Writes directly to `path`.
     """

@@ -45,7 +45,8 @@ def test_sbet_has_its_17_columns(solution, lla, tmp_path):  # noqa: F811
 def test_sbet_acceleration_is_without_gravity_and_forward_right_down(solution, tmp_path):  # noqa: F811
     """At rest: no acceleration. A turn to the left (up axis of the device) is negative about down."""
     gravity = np.broadcast_to([0.0, 0.0, solution.gravity], (len(solution), 3))
-    force = rotate_back(solution.nav_R_body, gravity) + [0.0, 2.0, 0.0]  # and 2 m/s^2 forward, +y
+    ahead = np.array([0.0, 2.0, 0.0])  # m/s^2, forward is +y
+    force = rotate_back(solution.nav_R_body, gravity) + ahead
     turning = np.tile([0.0, 0.0, 0.1], (len(solution), 1))
     at_rest = replace(solution, imu=Imu(t_ns=solution.t_ns, gyro=turning, accel=force))
     export(at_rest, "sbet", tmp_path / "a.sbet", clock_epoch="gps")
