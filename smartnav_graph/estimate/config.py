@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict
+from zoneinfo import ZoneInfo
 
 import tomli_w
 
@@ -19,6 +20,14 @@ from smartnav_graph.session.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
 from smartnav_graph.smoothers.incremental import ReplayConfig
 from smartnav_graph.smoothers.minimise import SolveConfig
+
+LOGOS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".svg": "image/svg+xml",
+    ".webp": "image/webp",
+}
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,30 @@ class RunOptions(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
+class ReportConfig:
+    """What the report shows beside the run.
+
+    company : name above the title; logo : PNG, JPEG, SVG or WebP file beside it; time_zone : of local times, such as
+    Europe/Berlin, never guessed; crs : system of the coordinates of control points, such as EPSG:25832
+    """
+
+    company: str = ""
+    logo: str = ""
+    time_zone: str = ""
+    crs: str = ""
+
+    def __post_init__(self) -> None:
+        if self.logo and Path(self.logo).suffix.lower() not in LOGOS:
+            raise ConfigError("config [report]", f"logo = {self.logo!r}", f"a file of {', '.join(LOGOS)}")
+        if self.time_zone:
+            try:
+                ZoneInfo(self.time_zone)
+            except (LookupError, OSError, ValueError) as error:
+                found, rule = f"time_zone = {self.time_zone!r}", "a name of the time zone database"
+                raise ConfigError("config [report]", found, rule, "for example Europe/Berlin or UTC") from error
+
+
+@dataclass(frozen=True)
 class GeneralConfig:
     """The sections that belong to no factor."""
 
@@ -92,6 +125,7 @@ class GeneralConfig:
     batch: BatchConfig = field(default_factory=BatchConfig)
     solver: SolveConfig = field(default_factory=SolveConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
 
 
 _OF_FACTORS = {factor.section: factor.config for factor in FACTORS.values()}

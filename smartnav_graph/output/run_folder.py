@@ -277,6 +277,7 @@ def _write_views(
             causal=run.causal,
             withheld=run.withheld,
             updates=updates,
+            config=run.problem.config,
         )
 
 

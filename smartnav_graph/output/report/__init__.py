@@ -1,7 +1,7 @@
 """One run on one page: a self-contained HTML report, and the same facts as Markdown.
 
-The page has inline SVG figures and inline CSS, no script and no network address: it opens offline and prints. Lines are
-thinned by `smartnav_graph.output.report.thin`.
+The page has inline SVG figures, inline CSS and one inline script (values under the pointer), and no network address: it
+opens offline and prints. Lines are thinned by `smartnav_graph.output.report.thin`.
 
 ``data-`` attributes hold the figures in full precision: ``#imu-gaps[data-count]`` with ``.imu-gap[data-start-s]
 [data-length-s][data-kind]``, ``tr[data-sensor][data-rejected]``, ``tr[data-withheld][data-rms-horizontal-m]``,
@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from smartnav_graph.core.files import replacing
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.graph.solution import Solution
@@ -37,6 +38,7 @@ def write_report(
     causal: Solution | None = None,
     withheld: Mapping[str, Scored] | None = None,
     updates: Updates | None = None,
+    config: Config | None = None,
 ) -> None:
     """Write the report of one run as a single HTML file; an older file at `path` is replaced.
 
@@ -50,13 +52,14 @@ def write_report(
     causal : the causal states of a replay
     withheld : by sensor, errors at withheld measurements: ``t_ns`` (n,) int64 and ``error`` (n, 3) m east, north, up
     updates : of a replay
+    config : options of the run, and company, logo, time zone and coordinate system of the report
 
     Raises
     ------
     SessionError
         The file cannot be written.
     """
-    text = page(session, solution, summary, evaluation, causal, withheld or {}, updates)
+    text = page(session, solution, summary, evaluation, causal, withheld or {}, updates, config)
     with replacing(path) as new:
         new.write_text(text, encoding="utf-8")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,9 @@ import numpy as np
 from smartnav_graph.calibrate.result import Chart
 from smartnav_graph.core.files import replacing
 from smartnav_graph.output.report.charts import figure
-from smartnav_graph.output.report.sections import TEMPLATE, contents, section
+from smartnav_graph.output.report.sections import contents, section
 from smartnav_graph.output.report.svg import Plot, axis, log_axis
+from smartnav_graph.output.report.template import filled, whole_page
 from smartnav_graph.output.text import Row, Table, number
 from smartnav_graph.session.calibration.pieces import Piece
 
@@ -37,10 +37,9 @@ def write_calibration_report(path: str | Path, kind: str, piece: Piece, charts: 
     lead = f"{len(piece.values)} values of {escape(', '.join(piece.sources))}, {escape(piece.date)}."
     head = (
         f'<header id="headline"><p class="kicker">smartnav calibration report</p><h1>{escape(title)}</h1>'
-        f'<p class="lead">{lead}</p></header>'
+        f'<p class="lead">{lead}</p></header>{filled("contents", contents=contents(body))}'
     )
-    style = files("smartnav_graph.output.report").joinpath("style.css").read_text(encoding="utf-8")
-    page = TEMPLATE.format(title=escape(title), style=style, body=head + contents(body) + body)
+    page = whole_page(title, head, body, footer=f"{title}, {piece.date}")
     with replacing(path) as new:
         new.write_text(page, encoding="utf-8")
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
-from importlib.resources import files
 
 import numpy as np
+from markupsafe import Markup
 
+from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.graph.solution import Solution
@@ -23,27 +24,18 @@ from smartnav_graph.output.report import (
     track,
     usage,
 )
+from smartnav_graph.output.report.about import changed_options, facts_of, logo_uri, options_of, utc_of
+from smartnav_graph.output.report.control_points import (
+    CONTRARY,
+    ControlRow,
+    control_rows,
+    control_summary,
+    control_table,
+)
+from smartnav_graph.output.report.template import filled, whole_page
 from smartnav_graph.output.summary_json import ImuGap, Summary, imu_gaps, numbers_of, verdict_lines
-from smartnav_graph.output.text import Table, attributes, fixed, metres, plural
+from smartnav_graph.output.text import Table, attributes, fixed, listed, metres, plural
 from smartnav_graph.session.session import Session
-
-TEMPLATE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<main>
-{body}
-</main>
-</body>
-</html>
-"""
 
 
 def page(
@@ -54,14 +46,21 @@ def page(
     causal_solution: Solution | None,
     scored: Mapping[str, charts.Scored],
     updates: Updates | None = None,
+    config: Config | None = None,
 ) -> str:
     """The whole HTML text."""
     gaps = imu_gaps(summary)
     shaded = [(start, start + length) for start, length, _ in gaps]
+    points = control_rows(session, solution, summary, "" if config is None else config.report.crs)
     parts = [
         verdict_section(summary),
+        filled(
+            "first",
+            trajectory=Markup(section("map", "Trajectory", track.draw(session, solution, gaps, causal_solution))),
+            about=filled("about", facts=facts_of(session, solution, summary, config)),
+        ),
+        control_section(points),
         warnings_section(solution, summary),
-        section("map", "Trajectory", track.draw(session, solution, gaps, causal_solution)),
         section("timeline", "Timeline", timeline.draw(solution, summary, shaded, scored)),
         section("statistics", "Summary", statistics.statistics_table(session, solution, summary).html()),
         used(session, solution, summary),
@@ -71,12 +70,22 @@ def page(
         withheld_section(summary, scored, solution, shaded),
         against_reference(evaluation, solution, shaded),
         *estimation(summary),
+        "" if config is None else filled("settings", options=options_of(config), changed=changed_options(config)),
     ]
     body = "\n".join(part for part in parts if part)
-    body = head(session, solution, summary) + contents(body) + body
     name = session.path.name if session.path else session.device.name
-    style = files("smartnav_graph.output.report").joinpath("style.css").read_text(encoding="utf-8")
-    return TEMPLATE.format(title=escape(f"{name}: run report"), style=style, body=body)
+    begin = utc_of(session, solution.t0_ns)
+    return whole_page(
+        f"{name}: run report",
+        head(session, solution, summary, config, contents(body)),
+        body,
+        footer=" · ".join([name, *([f"{begin:%Y-%m-%d}"] if begin else []), *_company(config)]),
+        utc_ms=round(begin.timestamp() * 1000) if begin else None,
+    )
+
+
+def _company(config: Config | None) -> list[str]:
+    return [config.report.company] if config is not None and config.report.company else []
 
 
 def section(name: str, title: str, body: str, data: Mapping[str, object] | None = None) -> str:
@@ -86,27 +95,27 @@ def section(name: str, title: str, body: str, data: Mapping[str, object] | None 
     return f'<section id="{name}"{attributes(data or {})}><h2>{escape(title)}</h2>{body}</section>'
 
 
-def contents(body: str) -> str:
-    """Links to the sections of the page."""
-    found = re.findall(r'<section id="([a-z-]+)"[^>]*><h2>([^<]+)</h2>', body)
-    links = "".join(f'<a href="#{name}">{title}</a>' for name, title in found)
-    return f'<nav aria-label="Contents">{links}</nav>'
+def contents(body: str) -> list[tuple[str, str]]:
+    """Name and title of the sections of the page."""
+    return re.findall(r'<section id="([a-z-]+)"[^>]*><h2>([^<]+)</h2>', body)
 
 
-def head(session: Session, solution: Solution, summary: Summary) -> str:
-    """Title, headline sentences, key figures."""
+def head(
+    session: Session, solution: Solution, summary: Summary, config: Config | None, links: list[tuple[str, str]]
+) -> str:
+    """Company, title, headline sentences, key figures, links."""
     device = "" if session.device.name == "unknown" else session.device.name
-    name = session.path.name if session.path else device or "Recorded session"
     uncertainty = statistics.horizontal_uncertainty(solution)
-    sentences = " ".join(escape(s) for s in facts.headline(summary, uncertainty))
-    tiles = "".join(
-        f"<div><dt>{escape(title)}</dt><dd>{escape(value)}</dd></div>"
-        for title, value in statistics.key_figures(summary, uncertainty)
-    )
-    kicker = f"smartnav run report · {device}" if session.path and device else "smartnav run report"
-    return (
-        f'<header id="headline"><p class="kicker">{escape(kicker)}</p><h1>{escape(name)}</h1>'
-        f'<p class="lead">{sentences}</p><dl class="tiles">{tiles}</dl>{sigma_sentence(solution)}</header>'
+    return filled(
+        "head",
+        company="".join(_company(config)),
+        logo="" if config is None else logo_uri(config.report.logo),
+        kicker=f"smartnav run report · {device}" if session.path and device else "smartnav run report",
+        name=session.path.name if session.path else device or "Recorded session",
+        sentences=" ".join(facts.headline(summary, uncertainty)),
+        tiles=statistics.key_figures(summary, uncertainty),
+        sigma=Markup(sigma_sentence(solution)),
+        contents=links,
     )
 
 
@@ -132,10 +141,26 @@ def verdict_section(summary: Summary) -> str:
     if not verdict_lines(summary):
         return ""
     level, *reasons = verdict_lines(summary)
-    text = f'<p class="calm"><strong>{escape(level.capitalize())}</strong></p>'
-    items = "".join(f"<li><strong>{escape(line)}</strong></li>" for line in reasons)
-    shown = text + (f'<ul class="warnings">{items}</ul>' if items else "")
-    return section("verdict", "Verdict", shown, {"level": level.removeprefix("verdict: "), "count": len(reasons)})
+    return filled("verdict", level=level.removeprefix("verdict: "), reasons=reasons)
+
+
+def control_section(rows: Sequence[ControlRow]) -> str:
+    """Every visit of a control point; empty without one."""
+    if not rows:
+        return ""
+    note = (
+        '<p class="fine">dE, dN, dU: computed less given. In: used in the estimate; σ of the solution then contains '
+        "the point itself. Withheld: an independent check.</p>"
+    )
+    contrary = [f"{row.point_id} at {fixed(row.t_s, 1)} s" for row in rows if row.is_contrary]
+    warning = (
+        f'<ul class="warnings"><li><strong>Withheld, and more than {CONTRARY:g} sigma off: {escape(listed(contrary))}'
+        "</strong><span>Check the point and its time; or the sigmas of the solution are too small.</span></li></ul>"
+        if contrary
+        else ""
+    )
+    body = warning + control_summary(rows).html() + control_table(rows).html() + note
+    return section("control", "Control points", body, {"count": len(rows)})
 
 
 def warnings_section(solution: Solution, summary: Summary) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats
+from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.timebase import interpolate, seconds_since
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Solution
@@ -78,11 +79,15 @@ def _when_and_where(session: Session, solution: Solution) -> list[tuple[str, str
         stamp = np.datetime_as_string(np.datetime64(int(solution.t_ns[0]), "ns"), unit="s")
         rows.append(("Begin (UTC)", str(stamp).replace("T", " ")))
     if solution.origin is not None:
-        o = solution.origin
-        north, east = "N" if o.lat_deg >= 0 else "S", "E" if o.lon_deg >= 0 else "W"
-        place = f"{abs(o.lat_deg):.6f}°{HARD}{north}, {abs(o.lon_deg):.6f}°{HARD}{east}, {fixed(o.height_m, 1)}{HARD}m"
-        rows.append(("Origin of east, north, up", place))
+        rows.append(("Origin of east, north, up", place_of(solution.origin)))
     return rows
+
+
+def place_of(origin: Origin) -> str:
+    """Latitude, longitude and height as text."""
+    north, east = "N" if origin.lat_deg >= 0 else "S", "E" if origin.lon_deg >= 0 else "W"
+    lat, lon = f"{abs(origin.lat_deg):.6f}°{HARD}{north}", f"{abs(origin.lon_deg):.6f}°{HARD}{east}"
+    return f"{lat}, {lon}, {fixed(origin.height_m, 1)}{HARD}m"
 
 
 def _span(solution: Solution) -> float:

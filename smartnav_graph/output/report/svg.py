@@ -1,4 +1,4 @@
-"""A small SVG plot: axes with round ticks, lines, bands, dots, bars. No script, no fixed colours, no address.
+"""A small SVG plot: axes with round ticks, lines, bands, dots, bars. No fixed colours, no address.
 
 Geometry lives in a nested ``<svg viewBox>`` that stretches with the page; tick labels are placed in per cent of the
 same box, so that text keeps its size on a phone, on a screen and on paper. Colours come from CSS classes.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 
 import numpy as np
@@ -33,6 +33,7 @@ class Axis:
     labels: tuple[str, ...]
     log: bool = False
     offset: float = 0.0
+    of_time: bool = False
 
     def titled(self, title: str) -> str:
         """The title of the axis, with the offset of its labels."""
@@ -100,7 +101,8 @@ def exact_axis(lo: float, hi: float, *, count: int = 6, step: float | None = Non
 def time_axis(lo: float, hi: float, count: int = 12) -> Axis:
     """Seconds since the start; ticks in seconds, at whole seconds, minutes or hours."""
     span = max(hi - lo, 1e-9)
-    return exact_axis(lo, hi, step=next((s for s in TIME_STEPS if span / s <= count), None), count=count)
+    step = next((s for s in TIME_STEPS if span / s <= count), None)
+    return replace(exact_axis(lo, hi, step=step, count=count), of_time=True)
 
 
 def log_axis(values: ArrayLike) -> Axis:
@@ -157,8 +159,8 @@ class Plot:
         fy = np.clip(1.0 - self.y.fraction(y), -1.0, 2.0)
         return np.rint(np.stack([fx * UNITS, fy * self._height], axis=-1)).astype(np.int64)
 
-    def line(self, x: ArrayLike, y: ArrayLike, cls: str, *, thin: bool = True) -> None:
-        """A line that breaks where y is not finite. A time line is thinned by `thin_line`."""
+    def line(self, x: ArrayLike, y: ArrayLike, cls: str, *, thin: bool = True, data: str = "") -> None:
+        """A line that breaks where y is not finite. A time line is thinned by `thin_line`; `data` are attributes."""
         xs, ys = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         if thin:
             xs, ys = thin_line(xs, ys)
@@ -166,7 +168,7 @@ class Plot:
         pieces = np.split(np.arange(len(xs)), np.flatnonzero(np.diff(good.astype(int))) + 1)
         d = "".join(path(self.points(xs[p], ys[p])) for p in pieces if len(p) and good[p[0]])
         if d:
-            self._shapes.append(f'<path class="line {cls}" d="{d}"/>')
+            self._shapes.append(f'<path class="line {cls}"{data} d="{d}"/>')
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, cls: str) -> None:
         """The area between `low` and `high`."""
@@ -244,6 +246,12 @@ class Plot:
         step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
         return [" odd" if len(ticks) > 5 and round(tick / step) % 2 else "" for tick in ticks]
 
+    def _ranges(self) -> str:
+        """Ranges of the axes for the time cursor, where x is time."""
+        if not self.x.of_time:
+            return ""
+        return f' data-x="{self.x.lo:.12g} {self.x.hi:.12g}" data-y="{self.y.lo:.12g} {self.y.hi:.12g} {self.y.log:d}"'
+
     def render(self) -> str:
         """The ``<svg>`` element."""
         size = f"aspect-ratio:{self.aspect:.4f}" if self.aspect else f"height:{self.height_px}px"
@@ -256,7 +264,7 @@ class Plot:
         if self.x_title:
             titles += f'<text class="title tx0" x="100%" y="100%" dy="37">{escape(self.x.titled(self.x_title))}</text>'
         return (
-            f'<svg class="{kind}" style="{size}" role="img" aria-label="{escape(self.label)}">'
+            f'<svg class="{kind}" style="{size}" role="img" aria-label="{escape(self.label)}"{self._ranges()}>'
             f'<svg class="box" viewBox="0 0 {UNITS} {self._height:.0f}" preserveAspectRatio="none" '
             f'width="100%" height="100%">{self._grid()}{"".join(self._shapes)}</svg>'
             f"{self._tick_labels()}{titles}{''.join(self._texts)}</svg>"

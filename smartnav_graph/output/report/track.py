@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from smartnav_graph.session.stream import Positioned
 
 SHAPES = (1.25, 2.4)  # width / height of the map
 ELLIPSES = 30
+CONTROL = {"used": "control", "unused": "control-withheld"}
+NARROW_PX, WIDE_PX = 290.0, 600.0  # width of the map on a phone, on a screen and on paper
 
 
 def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
@@ -78,9 +82,9 @@ def draw(
     if causal is not None and len(causal) > 1:
         _path(plot, causal.nav_t_body[:, :2], "line causal")
         entries.append(("line causal", "Causal estimate"))
-    _path(plot, path, "line path")
+    _path(plot, path, "line path", solution.seconds)
     entries += _fixes(plot, fixes, ("rejected",)) + under
-    _ends(plot, path)
+    _labels(plot, session, solution, _ends(plot, path))
     _scale_and_north(plot)
     widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
     return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
@@ -94,9 +98,15 @@ def _near(path: Floats, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) ->
     return np.asarray(rows[((rows >= lo - slack) & (rows <= hi + slack)).all(axis=1)])
 
 
-def _path(plot: Plot, xy: Floats, cls: str) -> None:
+def _path(plot: Plot, xy: Floats, cls: str, seconds: Floats | None = None) -> None:
+    """A path, with the times of its corners where they are given."""
     keep = thin_path(xy, (plot.x.hi - plot.x.lo) / 4000)
-    plot.line(xy[keep, 0], xy[keep, 1], cls.removeprefix("line "), thin=False)
+    data = ""
+    if seconds is not None:
+        points = plot.points(xy[keep, 0], xy[keep, 1])
+        keep = keep[np.concatenate([[True], (np.diff(points, axis=0) != 0).any(axis=1)])]
+        data = f' data-t="{" ".join(f"{t:.2f}".rstrip("0").rstrip(".") for t in seconds[keep])}"'
+    plot.line(xy[keep, 0], xy[keep, 1], cls.removeprefix("line "), thin=False, data=data)
 
 
 def _fixes(
@@ -111,7 +121,7 @@ def _fixes(
                 np.abs(plot.y.fraction(rows[:, 1]) - 0.5) <= 0.5
             )
             if len(rows):
-                cls = f"{'control' if name != 'gnss' and key == 'used' else f'fix-{key}'}"
+                cls = f"fix-{key}" if name == "gnss" or key == "rejected" else CONTROL[key]
                 plot.dots(rows[seen, 0], rows[seen, 1], cls)
                 outside = f", {count((~seen).sum())} off the map" if (~seen).any() else ""
                 entries.append((f"dots {cls}", f"{title_of(name)} {states_shown[key]} ({count(len(rows))}{outside})"))
@@ -158,7 +168,51 @@ def _spaced(solution: Solution) -> NDArray[np.intp]:
     return np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ELLIPSES)).clip(0, len(along) - 1))
 
 
-def _ends(plot: Plot, path: Floats) -> None:
+def _labels(plot: Plot, session: Session, solution: Solution, ends: Sequence[Mark]) -> None:
+    """Names of the control points, as far as they do not cover each other or the names of start and end on a small
+    screen; those of class ``wide`` have enough space only on a large one."""
+    points = session.control
+    if points is None:
+        return
+    points = points.take((points.t_ns >= solution.t_ns[0]) & (points.t_ns <= solution.t_ns[-1]))
+    nav, height = session.nav_position(points)[:, :2], 1.0 / (plot.aspect or 1.0)
+    places = np.column_stack([plot.x.fraction(nav[:, 0]), (1.0 - plot.y.fraction(nav[:, 1])) * height])
+    names = dict(zip(map(str, points.point_id), places.tolist(), strict=True))  # a point that is visited twice has one
+    boxes = {width: [end.box(width) for end in ends] for width in (NARROW_PX, WIDE_PX)}
+    for name, (x, y) in names.items():
+        mark = Mark(name, x, y, x > 0.8)
+        free = {width: not any(_overlap(mark.box(width), other) for other in boxes[width]) for width in boxes}
+        if not (name and 0.0 <= x <= 1.0 and 0.0 <= y <= height and free[WIDE_PX]):
+            continue
+        for width in boxes:
+            boxes[width] += [mark.box(width)] if free[width] else []
+        cls = f"name{' end' if mark.leftward else ''}{'' if free[NARROW_PX] else ' wide'}"
+        at = f'x="{100 * x:.2f}%" y="{100 * y / height:.2f}%" dx="{-8 if mark.leftward else 8}" dy="4"'
+        plot.raw(f'<text class="{cls}" {at}>{escape(name)}</text>')
+
+
+class Mark(NamedTuple):
+    """A name beside a point at (x, y), in shares of the width of the map."""
+
+    name: str
+    x: float
+    y: float
+    leftward: bool
+
+    def box(self, width: float) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom of the text on a map of `width` px."""
+        near, far = 8 / width, (8 + 7.5 * len(self.name)) / width
+        left, right = (self.x - far, self.x - near) if self.leftward else (self.x + near, self.x + far)
+        return left, self.y - 22 / width, right, self.y + 22 / width
+
+
+def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _ends(plot: Plot, path: Floats) -> list[Mark]:
+    """Start and end with their names."""
+    marks, height = [], 1.0 / (plot.aspect or 1.0)
     a, b = path[0], path[-1]
     where = [(float(plot.x.fraction(p[0])), 1 - float(plot.y.fraction(p[1]))) for p in (a, b)]
     left = where[0][0] <= where[1][0]
@@ -169,6 +223,8 @@ def _ends(plot: Plot, path: Floats) -> None:
         plot.text(
             p[0], p[1], name, f"note {'end' if outward else ''}", dx=-10 if outward else 10, dy=-8 if on_left else 16
         )
+        marks.append(Mark(name, fx, fy * height, outward))
+    return marks
 
 
 def _scale_and_north(plot: Plot) -> None:

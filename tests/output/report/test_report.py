@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 import time
 from dataclasses import replace
@@ -17,6 +19,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.graph.solution import Residuals, Solution
 from smartnav_graph.output.report import facts, reference, report_markdown, write_report
 from smartnav_graph.output.report.statistics import accelerations
+from smartnav_graph.output.report.template import whole_page
 from smartnav_graph.output.report.timeline import lanes
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Imu
@@ -146,8 +149,9 @@ def test_sections_are_in_reading_order(dom) -> None:
     assert ids == [
         *(
             "headline",
-            "warnings",
             "map",
+            "about",
+            "warnings",
             "timeline",
             "statistics",
             "used",
@@ -174,7 +178,14 @@ def test_sections_are_in_reading_order(dom) -> None:
 def test_foreign_text_is_escaped_and_nothing_is_fetched(page) -> None:
     text = page.read_text(encoding="utf-8")
     assert "&lt;b&gt;missing&lt;/b&gt; &amp; assumed" in text
-    assert not re.search(r"<script|https?:|src=|href=.(?!#)|url\(|@import", text)
+    assert not re.search(r"https?:|src=|href=.(?!#)|url\(|@import", text)
+
+
+def test_the_only_script_is_allowed_by_its_hash(page, tmp_path) -> None:
+    (script,) = re.findall(r"<script>(.*?)</script>", page.read_text(encoding="utf-8"), re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in page.read_text(encoding="utf-8")
+    assert "<script" not in whole_page("plain", "", "<p>no plots over time</p>")
 
 
 def test_statistics_of_motion_and_imu(dom, case) -> None:
@@ -384,7 +395,7 @@ def test_bare_solution(tmp_path, case) -> None:
     dom = written(tmp_path, case, session=Session(), solution=bare, summary={"gaps": None, "withheld": None})
     assert "The position uncertainty is unknown" in words(section(dom, "sigma-at"))
     assert "recorded no residuals" in words(section(dom, "residuals"))
-    assert "nan" not in words(dom).lower()
+    assert "nan" not in words(dom.find(".//main")).lower()
     assert not any("nan" in d for d in dom.xpath("//path/@d"))
     one = {name: getattr(bare, name)[:1] for name in ("t_ns", "nav_R_body", "nav_t_body", "nav_v_body")}
     one |= {name: getattr(bare, name)[:1] for name in ("accel_bias", "gyro_bias", "covariance")}

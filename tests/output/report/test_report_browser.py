@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from drive_case import drive
+from drive_case import Drive, drive
 from playwright import sync_api
 
 from smartnav_graph.cli import main
@@ -122,6 +122,42 @@ def test_real_run(browser: Any, kitti_run: Path, width: int, scheme: str) -> Non
     )
     assert said is not None
     assert [float(x) for x in said.groups()] == pytest.approx([np.hypot(e, n), e, n, u], abs=6e-4)  # m, as rounded
+    tab.close()
+
+
+def test_values_under_the_pointer(browser: Any, page: Path, case: Drive) -> None:
+    """The time cursor is in all plots, its values are those of the solution, and it marks the place on the map."""
+    tab = browser.new_page(viewport={"width": 1400, "height": 900})
+    tab.goto(page.resolve().as_uri())
+    assert tab.locator("#cursor").is_hidden()
+    tab.locator("#uncertainty svg.plot").first.hover()
+    said = tab.locator("#cursor").inner_text()
+    t = float(re.search(r"t = ([\d.]+) s", said)[1])
+    assert t == pytest.approx(case.solution.seconds[-1] / 2, abs=1.0)
+    found = {name: float(value) for name, value in re.findall(r"(East|North|Up) ([\d.]+)", said)}
+    for i, name in enumerate(("East", "North", "Up")):
+        expected = np.interp(t, case.solution.seconds, case.solution.sigmas[:, 3 + i])
+        assert found[name] == pytest.approx(expected, rel=0.02), said
+    cursors = tab.evaluate("[...document.querySelectorAll('.time-cursor')].map(c => c.getAttribute('x1'))")
+    assert len(cursors) > 15 and len(set(cursors)) == 1
+    places = "['#map .place-cursor', '#map .start'].map(c => document.querySelector(c).getBoundingClientRect())"
+    before, start = tab.evaluate(f"{places}.map(r => [r.x + r.width / 2, r.y + r.height / 2])")
+    assert np.hypot(*np.subtract(before, start)) > 20
+    tab.locator("#map .start").hover(force=True)
+    assert float(re.search(r"t = ([\d.]+) s", tab.locator("#cursor").inner_text())[1]) < 10.0
+    tab.keyboard.press("Escape")
+    assert tab.locator("#cursor").is_hidden()
+    tab.close()
+
+
+def test_print_shows_what_the_screen_folds(browser: Any, kitti_run: Path) -> None:
+    tab = browser.new_page(viewport={"width": 700, "height": 900})
+    tab.goto((kitti_run / "report.html").resolve().as_uri())
+    row = tab.locator(".rejections tbody tr").first
+    assert row.is_hidden()
+    tab.emulate_media(media="print")
+    assert row.is_visible() and tab.locator(".options dd").first.is_visible() and tab.locator(".sign").is_visible()
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 700
     tab.close()
 
 
