@@ -1,8 +1,8 @@
 """SBET and NMEA 0183: trajectories as survey software reads them. Both need dates: a clock of the Unix or GPS epoch.
 
 SBET (Applanix, smoothed best estimate of trajectory): 17 little-endian doubles a row. Time in seconds of the GPS week;
-latitude and longitude rad, ellipsoidal height m; velocity m/s north, east, down (the wander angle is zero); roll,
-pitch, heading rad; wander angle; acceleration m/s^2 with gravity removed, and angular rate rad/s, forward, right, down
+latitude and longitude rad, ellipsoidal height m; velocity m/s north, east, down; roll, pitch, heading rad; the azimuth
+of the frame of velocities, zero; acceleration m/s^2 with gravity removed, and angular rate rad/s, forward, right, down
 (zero where the run holds no inertial data).
 
 NMEA: GGA of quality 6 (estimated), RMC, GST, and THS (true heading). Heights are ellipsoidal, and the geoid separation

@@ -25,7 +25,7 @@ def filled(template: str, /, **values: object) -> Markup:
 
 
 def whole_page(title: str, head: str, body: str, *, footer: str = "", utc_ms: int | None = None) -> str:
-    """The page around head and body, which are HTML; `footer` stands on every printed page, `utc_ms` is the Unix time
+    """The page around head and body, which are HTML; `footer` is on every printed page, `utc_ms` is the Unix time
     of second zero, where known."""
     style, script = (files(PACKAGE).joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "cursor.js"))
     script = script if " data-x=" in body else ""  # only a page with plots over time has a cursor
