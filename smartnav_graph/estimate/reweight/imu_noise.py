@@ -42,6 +42,8 @@ MOST = 5.0
 WIDEST, WIDEST_OF_SAMPLES = 10.0, 5.0
 # Factor on either beyond which something else may be what makes the noise appear so.
 WORSE = 2.5
+# Share of the largest scale from which it is reached.
+AT_MOST = 0.99
 # Normalised square at which fixes contradict their sigma.
 CONTRADICTION = 2.0
 # A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
@@ -199,7 +201,7 @@ def noise_scales(
     if builder is None or len(windows) < 2:
         return {}
     known, prior = builder.sampling_scales(), builder.prior_scales()
-    most = {name: max(WIDEST, WIDEST_OF_SAMPLES * known.get(name, 0.0)) for name in NOISE_NAMES}
+    most = {name: _most(known.get(name, 0.0)) for name in NOISE_NAMES}
     weight = {name: CLASS_WEIGHT if name in prior else builder.weight for name in NOISE_NAMES}
     return {
         name: part.scale(pass_state.scale(name), weight[name], most[name], level, prior.get(name, 1.0))
@@ -208,10 +210,16 @@ def noise_scales(
     }
 
 
+def _most(own: float) -> float:
+    """The largest scale of a group whose samples show the scale `own`."""
+    return max(WIDEST, WIDEST_OF_SAMPLES * own)
+
+
 def worse_than_class(builder: ImuBuilder, pass_state: PassState) -> dict[str, float]:
-    """Scales of the white inertial noise found, where they are beyond its class and what the samples show."""
+    """Scales of the white inertial noise found, where they are beyond its class and what the samples show, or as large
+    as they may become."""
     return {
         name: pass_state.scale(name)
         for name, own in builder.sampling_scales().items()
-        if pass_state.scale(name) > WORSE * max(1.0, WIDEST_OF_SAMPLES * own)
+        if pass_state.scale(name) > min(WORSE * max(1.0, WIDEST_OF_SAMPLES * own), AT_MOST * _most(own))
     }

@@ -57,6 +57,16 @@ def test_no_noise_is_left_out(rows: int) -> None:
     assert np.mean(sigmas) == pytest.approx(2.5, rel=0.1)
 
 
+@pytest.mark.parametrize("rows", range(490, 600, 10))
+def test_noise_that_changes_with_time_has_no_outliers(rows: int) -> None:
+    """However many fixes there are: nearly half of them would have to be left out."""
+    rng = np.random.default_rng(4)
+    level = np.repeat(0.03 * np.exp(rng.normal(0.0, 1.3, 60)), 10)
+    position = level[:, None] * rng.standard_normal((600, 2))
+    found = scatter(stamps(600)[:rows], position[:rows])
+    assert found is not None and found.is_noise
+
+
 def test_motion_is_no_noise() -> None:
     t = np.arange(300.0)
     position = np.stack([20 * np.sin(0.9 * t), 20 * np.cos(0.9 * t)], axis=1)
