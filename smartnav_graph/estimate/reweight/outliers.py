@@ -11,6 +11,8 @@ from scipy.stats import chi2
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import rotate, skew
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.factors.gauss_markov import correlated_sigma
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.graph.pass_state import LAST_STAGE, PassState
 from smartnav_graph.graph.states import key
@@ -25,8 +27,8 @@ class FixResiduals:
 
     rows (m,); keyframe (m,) position in the estimate; residual (m, 3) nav m; sigma (m, 3) m as used;
     posterior (m, 3) variance of the predicted position, m^2; fitted (m, 3) share of each component's variance that the
-    solution fits, of all its states, NaN where the row is not used; clock (m, 1) m that a clock not yet looked at may
-    put between a good fix and its neighbours
+    solution fits, of all its states, NaN where the row is not used; other (m, 3) m that may lie between a good fix and
+    its neighbours besides: a clock not yet looked at, the change of a correlated error since the nearest rows in use
     """
 
     rows: NDArray[np.intp]
@@ -34,7 +36,7 @@ class FixResiduals:
     residual: Floats
     sigma: Floats
     posterior: Floats
-    clock: Floats
+    other: Floats
     fitted: Floats | None = None
 
     @property
@@ -72,7 +74,9 @@ def fix_residuals(
     P = estimate.covariance[keyframe][:, :6, :6]
     there = np.concatenate([-skew(rotate(R, lever)), np.broadcast_to(np.eye(3), R.shape)], axis=2)  # of the antenna
     posterior = np.diagonal(there @ P @ there.transpose(0, 2, 1), axis1=1, axis2=2)
-    return FixResiduals(rows, keyframe, residual, sigma, posterior, _by_clock(builder, v, pass_state))
+    t_s = np.array([windows[k].t1_ns for k in keyframe], dtype=np.int64) / NS
+    other = _by_clock(builder, v, pass_state) + _by_correlated_error(builder, rows, t_s, pass_state)
+    return FixResiduals(rows, keyframe, residual, sigma, posterior, other)
 
 
 def _by_clock(builder: PositionBuilder, v: Floats, pass_state: PassState) -> Floats:
@@ -83,6 +87,23 @@ def _by_clock(builder: PositionBuilder, v: Floats, pass_state: PassState) -> Flo
     around = np.concatenate([v[:1], v, v[-1:]])
     change = np.linalg.norm(around[2:] - around[:-2], axis=1, keepdims=True)
     return np.asarray(builder.config.time_offset_sigma * change)
+
+
+def _by_correlated_error(
+    builder: PositionBuilder, rows: NDArray[np.intp], t_s: Floats, pass_state: PassState
+) -> Floats:
+    """Sigma (m, 3) m of what a correlated error that is a state may change between rows not in use and the nearest in
+    use before and after; nothing for rows in use, whose error the state has."""
+    out = np.zeros((len(rows), 3))
+    if builder.name in pass_state.correlated:
+        used = pass_state.used(builder.name, rows)
+        before = t_s - np.maximum.accumulate(np.where(used, t_s, -np.inf))
+        after = np.minimum.accumulate(np.where(used, t_s, np.inf)[::-1])[::-1] - t_s
+        with np.errstate(divide="ignore"):
+            apart = 1.0 / (1.0 / before[~used] + 1.0 / after[~used])
+        share = -np.expm1(-2.0 * apart / builder.noise.correlated_time)
+        out[~used] = np.sqrt(share)[:, None] * correlated_sigma(builder.noise)
+    return out
 
 
 def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
@@ -127,7 +148,7 @@ def verdicts(
 
 def _position_verdict(builder: PositionBuilder, found: FixResiduals, pass_state: PassState) -> Verdict:
     sigma = np.maximum(builder.scaled_sigma(pass_state)[found.rows], builder.least_gate_sigma)
-    square = (found.residual**2 / (sigma**2 + found.clock**2)).sum(axis=1)
+    square = (found.residual**2 / (sigma**2 + found.other**2)).sum(axis=1)
 
     def limit(level: float, probability: float | None) -> Floats:
         return builder.limit(level, found.rows, probability)
