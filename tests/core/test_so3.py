@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -29,7 +29,6 @@ def rotation_vector(axis, angle):
     return angle * axis / np.linalg.norm(axis)
 
 
-@settings(deadline=None)
 @given(axes)
 def test_across_is_perpendicular(v):
     both = across(v)[0]
@@ -37,7 +36,6 @@ def test_across_is_perpendicular(v):
     np.testing.assert_allclose(v @ both, 0.0, atol=1e-14 * np.abs(v).max())
 
 
-@settings(deadline=None)
 @given(vectors)
 def test_exp_gives_rotation_matrices(w):
     R = exp(w)
@@ -52,7 +50,6 @@ def test_exp_turns_counter_clockwise():
     np.testing.assert_allclose(exp(np.array([np.pi / 2, 0.0, 0.0])) @ [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], atol=1e-15)
 
 
-@settings(deadline=None)
 @given(vectors)
 def test_exp_is_the_power_series(w):
     w = 0.1 * w[:1]
@@ -63,7 +60,6 @@ def test_exp_is_the_power_series(w):
     np.testing.assert_allclose(exp(w), total, atol=1e-13)
 
 
-@settings(deadline=None)
 @given(vectors)
 def test_exp_of_log(w):
     R = exp(w)
@@ -71,7 +67,6 @@ def test_exp_of_log(w):
     assert np.linalg.norm(log(R), axis=1).max() <= np.pi + 1e-12
 
 
-@settings(deadline=None)
 @given(axes, angles)
 def test_log_of_exp(axis, angle):
     w = rotation_vector(axis, angle)
@@ -85,14 +80,12 @@ def test_exp_and_log_of_any_shape():
     np.testing.assert_array_equal(exp(w)[1, 2], exp(w[1, 2]))
 
 
-@settings(deadline=None)
 @given(vectors, vectors)
 def test_skew_is_the_cross_product(a, b):
     np.testing.assert_allclose(rotate(skew(a), b), np.cross(a, b), atol=1e-13)
     np.testing.assert_array_equal(skew(a), -skew(a).transpose(0, 2, 1))
 
 
-@settings(deadline=None)
 @given(vectors, vectors)
 def test_rotations_row_by_row(w, v):
     R = exp(w)
@@ -100,7 +93,6 @@ def test_rotations_row_by_row(w, v):
     np.testing.assert_allclose(rotate_back(R, rotate(R, v)), v, atol=1e-13)
 
 
-@settings(deadline=None)
 @given(vectors)
 def test_quaternions(w):
     R = exp(w)
@@ -116,7 +108,6 @@ def test_the_real_part_of_a_quaternion_comes_first():
     np.testing.assert_allclose(quaternion(exp(np.array([[0.0, 0.0, np.pi / 2]]))), quarter, atol=1e-15)
 
 
-@settings(deadline=None)
 @given(axes, angles, axes)
 def test_jacobians_are_the_numerical_derivatives(axis, angle, direction):
     theta, d = rotation_vector(axis, angle), rotation_vector(direction, 1e-6)

@@ -98,7 +98,7 @@ DAY_NS = 86_400 * 10**9
     steps=st.lists(st.integers(1, 29 * DAY_NS), min_size=1, max_size=4),
     values=hnp.arrays(np.float64, (5, 6), elements=readings),
 )
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_every_bit_survives(first, steps, values, tmp_path):
     stamps, n = first + np.cumsum([0, *steps]), 1 + len(steps)
     imu = Imu(t_ns=stamps, gyro=values[:n, :3], accel=values[:n, 3:])

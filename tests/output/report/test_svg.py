@@ -17,7 +17,7 @@ from smartnav_graph.output.report.track import _axes
 from smartnav_graph.output.text import Row, Table, count, distance, duration, number
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(-1e6, 1e6), st.floats(1e-4, 1e6))
 def test_linear_axis_covers_its_data_with_few_round_ticks(lo: float, span: float) -> None:
     a = axis([lo, lo + span])
@@ -81,7 +81,7 @@ def test_thinned_band_still_holds_the_whole_band() -> None:
     assert (np.interp(t, x, hi) >= np.interp(t, x, lo)).all()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_thinned_path_stays_within_its_tolerance(seed: int) -> None:
     xy = np.cumsum(np.random.default_rng(seed).normal(size=(800, 2)), axis=0)
