@@ -1,17 +1,20 @@
-"""What is handed on: the files of the project's root and the content of the wheel."""
+"""What is handed on: the files of the project's root, the content of wheel and source distribution."""
 
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+# Licences that dependencies must not have.
+REFUSED = re.compile(r"\b(?:A?GPL|GNU (?:Affero )?General Public)", re.IGNORECASE)
 
 
 def test_the_licence_is_the_one_declared():
@@ -27,19 +30,98 @@ def test_the_citation_and_the_changelog_know_the_version():
 
 
 def test_no_dependency_comes_from_an_address():
-    declared = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["test"]]
+    extras = PROJECT["optional-dependencies"]
+    declared = [*PROJECT["dependencies"], *(text for extra in extras.values() for text in extra)]
+    assert all(extras.values())  # no empty ones
     assert not [text for text in declared if "@" in text or "/" in text]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(find_spec("build") is None, reason="needs the package `build`")
-def test_the_wheel_contains_what_it_must(tmp_path):
-    subprocess.run([sys.executable, "-m", "build", "--outdir", tmp_path, ROOT], check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The folder with a wheel and a source distribution, each built from the sources."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT]
+    subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+def tracked(*places):
+    """Files under version control; all files where there is no git."""
+    done = subprocess.run(["git", "ls-files", *places], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode == 0 and done.stdout:
+        return {name for name in done.stdout.splitlines() if (ROOT / name).is_file()}
+    found = [path for place in places for path in (ROOT / place).rglob("*") if path.is_file()]
+    return {path.relative_to(ROOT).as_posix() for path in found if "__pycache__" not in path.parts}
+
+
+def test_the_wheel_contains_what_it_must(built):
+    (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    package = ROOT / "smartnav_graph"
-    files = {str(path.relative_to(ROOT)) for path in package.rglob("*") if path.suffix not in ("", ".pyc")}
+    files = tracked("smartnav_graph")
     assert {"smartnav_graph/py.typed", "smartnav_graph/output/report/style.css"} <= files <= names
-    rest = {name.split("/", 1)[1] for name in names - files}
+    rest = {name.split("/", 1)[1] for name in names - files if ".dist-info/" in name}
     assert rest == {"METADATA", "WHEEL", "entry_points.txt", "licenses/LICENSE", "RECORD"}
-    assert len(list(tmp_path.glob("*.tar.gz"))) == 1
+    assert not {name for name in names if not name.startswith("smartnav_graph")}
+
+
+def test_the_source_distribution_can_be_built_tested_and_documented(built):
+    (archive,) = built.glob("*.tar.gz")
+    with tarfile.open(archive) as opened:
+        names = {name.split("/", 1)[1] for name in opened.getnames() if "/" in name}
+    files = tracked("smartnav_graph", "tests", "scripts", "docs", "datasets", ".ci", ".github")
+    root = {"pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "CITATION.cff", "PKG-INFO"}
+    root |= {"constraints.txt", "mkdocs.yml", "Dockerfile", ".dockerignore"}
+    assert files | root <= names
+    # no data, no environments, nothing that was made by a build
+    extra = {name for name in names - files - root if "/" in name}
+    assert not {name for name in extra if name.startswith((".venv", "site/", "demo/", "out/", ".git/"))}
+
+
+def test_extras_of_the_wheel_are_those_declared(built):
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as opened:
+        (name,) = [name for name in opened.namelist() if name.endswith("METADATA")]
+        text = opened.read(name).decode()
+    assert set(re.findall(r"^Provides-Extra: (\S+)", text, re.MULTILINE)) == set(PROJECT["optional-dependencies"])
+    assert "Requires-Python: >=3.11" in text and "License-Expression: BSD-3-Clause" in text
+
+
+def test_no_dependency_is_under_a_licence_that_binds_others():
+    from importlib.metadata import PackageNotFoundError, metadata
+
+    pins = [line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    found = {}
+    for name in pins:
+        try:
+            about = metadata(name)
+        except PackageNotFoundError:
+            continue  # of another platform or extra
+        licences = [about.get("License-Expression") or "", (about.get("License") or "").split("\n")[0]]
+        licences += [text for text in about.get_all("Classifier", []) if text.startswith("License ::")]
+        text = " | ".join(licences)
+        if REFUSED.search(text.replace("LGPL", "")):
+            found[name] = text
+    assert not found
+
+
+def test_the_release_workflow_publishes_what_it_built_without_a_token():
+    text = (ROOT / ".github/workflows/release.yml").read_text()
+    jobs = yaml.safe_load(text)["jobs"]
+    assert jobs["publish"]["permissions"] == {"id-token": "write"} and jobs["publish"]["needs"] == ["build", "install"]
+    assert "secrets." not in text and "password" not in text
+    assert "windows-latest" in jobs["install"]["strategy"]["matrix"]["os"]
+    assert any("python -m build" in step.get("run", "") for step in jobs["build"]["steps"])
+
+
+def test_the_image_installs_the_pinned_versions_and_nothing_else():
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    assert all("slim" in line for line in lines if line.startswith("FROM"))
+    assert "-c constraints.txt" in "\n".join(lines) and 'ENTRYPOINT ["smartnav"]' in lines
+    copied = [name for line in lines if line.startswith("COPY") and "--from" not in line for name in line.split()[1:-1]]
+    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert set(copied) == kept and all((ROOT / name).exists() for name in copied)
+
+
+def test_the_module_is_the_command():
+    done = subprocess.run([sys.executable, "-m", "smartnav_graph", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"smartnav {PROJECT['version']}\n"
