@@ -28,15 +28,19 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from nbclient import NotebookClient
 
+import smartnav_graph as sn
 from smartnav_graph.calibrate import KINDS
 from smartnav_graph.cli import COMMANDS, command_class
 from smartnav_graph.cli.help import described, help_text, shown_value
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.readers import READERS
+from smartnav_graph.session.stream import Stream
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 CELL_SECONDS = 240
+FIRST = ("load", "smooth", "run", "Session", "Solution", "Run")
+_made = dict[tuple[str, str], dict[str, str | bytes]]()
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -45,10 +49,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/commands.md": commands_page(),
         "reference/configuration.md": configuration_page(),
         "reference/formats.md": formats_page(),
+        "reference/python.md": python_page(),
     }
     root = Path(config.docs_dir)
     for source in sorted([*root.glob("tutorials/*.py"), root / "gallery.py"]):
-        pages |= notebook_pages(source, source.relative_to(root).with_suffix("").as_posix())
+        text, name = source.read_text(encoding="utf-8"), source.relative_to(root).with_suffix("").as_posix()
+        if (name, text) not in _made:  # while mkdocs serves, only what was changed is executed again
+            _made[name, text] = notebook_pages(source, name)
+        pages |= _made[name, text]
         files.remove(files.src_uris[source.relative_to(root).as_posix()])
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
@@ -201,6 +209,29 @@ def formats_page() -> str:
     lines[-1] += "[Bring in a log](../how-to/logs.md#any-other-text-file). This list is that of `smartnav formats`."
     lines += ["", "| name | what it is | recognised by |", "|---|---|---|"]
     lines += [f"| `{r.name}` | {_cell(r.summary)} | {_cell(r.recognised_by)} |" for r in READERS.values()]
+    return "\n".join(lines) + "\n"
+
+
+def python_page() -> str:
+    """Every public name, from its docstring."""
+    names = {name: getattr(sn, name) for name in sn.__all__}
+    groups = {"Functions": [], "Recordings and results": [], "Streams": [], "Errors": []}  # type: dict[str, list[str]]
+    for name, found in names.items():
+        if not isinstance(found, type):
+            groups["Functions"].append(name)
+        elif issubclass(found, Stream):
+            groups["Streams"].append(name)
+        else:
+            groups["Errors" if issubclass(found, Exception) else "Recordings and results"].append(name)
+    lines = ["# Python", "", "```python", "import smartnav_graph as sn", "```", "", "Everything on this page is "]
+    lines[-1] += "`sn.NAME`. Frames, units and signs: [Conventions](../understand/conventions.md). Columns of the streams: "
+    lines[-1] += "[The session folder](../session-format.md)."
+    for title, members in groups.items():
+        lines += ["", f"## {title}"]
+        for name in sorted(members, key=lambda one: (one not in FIRST, one.lower())):
+            lines += ["", f"::: {names[name].__module__}.{names[name].__qualname__}"]
+            if title == "Streams":
+                lines += ["    options:", "      inherited_members: false"]
     return "\n".join(lines) + "\n"
 
 

@@ -30,8 +30,25 @@ positions.head(3)
 # %% [markdown]
 # ## Build a session
 #
-# INSERT-SESSION
-#
+# Each stream checks its rows when it is made: units by their names, times as whole nanoseconds, no NaN.
+
+# %%
+from smartnav_graph.core.frames import Origin
+from smartnav_graph.session.streams import GnssFix, Imu
+
+session = sn.Session(
+    imu=Imu(
+        t_ns=inertial.index.as_unit("ns").asi8,
+        gyro=inertial[["wx", "wy", "wz"]].to_numpy(),
+        accel=inertial[["ax", "ay", "az"]].to_numpy(),
+    ),
+    gnss=GnssFix(t_ns=positions.index.as_unit("ns").asi8, lla=positions.to_numpy()),
+    origin=Origin(*positions.iloc[0]),
+    clock_epoch="unix",
+)
+{name: len(stream) for name, stream in session.streams().items()}
+
+# %% [markdown]
 # ## Smooth
 #
 # `sn.smooth` gives a `Solution`. Its arrays have rows = epochs; `to_pandas` makes a table of it.

@@ -45,8 +45,6 @@ plt.show()
 # GTSAM's incremental smoother.
 
 # %%
-from smartnav_graph.smoothers.incremental import ReplayConfig
-
 replay = sn.run(euroc, causal=True)
 updates = replay.summary["update_ms"]
 print(f"an update takes {updates['median']:.1f} ms (median), {updates['p99']:.1f} ms (99 %)")
@@ -83,6 +81,7 @@ print({name: round(value, 2) for name, value in found.nees.items() if value is n
 
 # %% [markdown]
 # The last line is the consistency (NEES): squared errors over their covariance, 3 on average for three components, 1
-# for yaw, where the covariance is right. Much above: too optimistic.
+# for yaw, where the covariance is right. One recording is one draw of an error that drifts slowly, so average over several
+# before you conclude anything from it.
 #
 # INSERT-FACTOR
