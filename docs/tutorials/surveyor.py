@@ -48,7 +48,7 @@ with zipfile.ZipFile("site-visit.zip", "w", zipfile.ZIP_DEFLATED) as archive:
 
 stops = {p: i for i, p in enumerate(made.control.point_id)}
 east, north = Transformer.from_crs(4979, 32632, always_xy=True).transform(made.control.lla[:, 1], made.control.lla[:, 0])
-utc = [pd.to_datetime(edge, unit="ns").strftime("%Y-%m-%dT%H:%M:%S.%fZ") for edge in (made.static.t_ns, made.static.t_end_ns)]
+utc = [pd.to_datetime(edge, unit="ns").strftime("%Y-%m-%dT%H:%M:%SZ") for edge in (made.static.t_ns, made.static.t_end_ns)]
 points = pd.DataFrame(
     {"id": made.control.point_id, "start": utc[0], "end": utc[1], "E": east, "N": north, "h": made.control.lla[:, 2], "EPSG": 32632, "sigma": 0.02}
 ).round(4)
