@@ -17,7 +17,7 @@ INK = {"path": "#3949ab", "fix": "#d2691e", "point": "#111111"}
 
 def draw(run, title, fixes=None, points=None, name=None):
     """Path, speed, and horizontal sigma over time."""
-    solution, session = run.solution, run.session
+    solution = run.solution
     figure, axes = plt.subplot_mosaic([["map", "speed"], ["map", "sigma"]], figsize=(10, 4.6), layout="constrained")
     if fixes is not None:
         axes["map"].plot(*fixes[:, :2].T, ".", ms=3, color=INK["fix"], label="fixes")

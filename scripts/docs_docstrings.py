@@ -1,4 +1,4 @@
-"""Docstrings for the reference of the documentation: ``name : text`` of a parameter is its description, not its type."""
+"""Docstrings in the reference of the documentation: ``name : text`` of a parameter is a description, not a type."""
 
 from __future__ import annotations
 

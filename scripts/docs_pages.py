@@ -158,7 +158,7 @@ def outputs(cell: nbformat.NotebookNode, alternative: str) -> Iterator[str | tup
             table = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
             yield f'<div class="output" tabindex="0" role="region" aria-label="output">{table}</div>'
         elif text := CONTROL.sub("", data["text/plain"]).rstrip():
-            yield f"```text title=\"Output\"\n{text}\n```"
+            yield f'```text title="Output"\n{text}\n```'
 
 
 # --------------------------------------------------------------------------------------------------- references
@@ -224,8 +224,8 @@ def python_page() -> str:
         else:
             groups["Errors" if issubclass(found, Exception) else "Recordings and results"].append(name)
     lines = ["# Python", "", "```python", "import smartnav_graph as sn", "```", "", "Everything on this page is "]
-    lines[-1] += "`sn.NAME`. Frames, units and signs: [Conventions](../understand/conventions.md). Columns of the streams: "
-    lines[-1] += "[The session folder](../session-format.md)."
+    lines[-1] += "`sn.NAME`. Frames, units and signs: [Conventions](../understand/conventions.md). Columns of "
+    lines[-1] += "the streams: [The session folder](../session-format.md)."
     for title, members in groups.items():
         lines += ["", f"## {title}"]
         for name in sorted(members, key=lambda one: (one not in FIRST, one.lower())):
@@ -282,6 +282,5 @@ def broken_links(site: Path) -> Iterator[str]:
             target = target / "index.html" if target.is_dir() else target
             if not target.is_file():
                 yield f"{where}: {link} does not exist"
-            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
-                if not parts.fragment.startswith("__"):
-                    yield f"{where}: {link} has no such anchor"
+            elif target in pages and unquote(parts.fragment) not in {"", *pages[target].anchors}:
+                yield f"{where}: {link} has no such anchor"

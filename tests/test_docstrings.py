@@ -23,13 +23,21 @@ def is_documented(one: Defined) -> bool:
     return ast.get_docstring(one) is not None or "overload" in names or any(name.endswith(".setter") for name in names)
 
 
+def signature(one: Defined) -> tuple[str, ...]:
+    """Name and names of the arguments."""
+    arguments = [] if isinstance(one, ast.ClassDef) else [argument.arg for argument in one.args.args]
+    return (one.name, *arguments)
+
+
 def missing(trees: dict[str, ast.Module]) -> Iterator[str]:
     """Public modules, functions, classes and methods without a docstring.
 
     A method that overrides a documented one of the package, as those of builders and commands do, has that of the
-    method that it overrides.
+    method that it overrides; one with name and arguments of a documented method of a protocol has that.
     """
     classes = {one.name: one for tree in trees.values() for one in public(tree.body) if isinstance(one, ast.ClassDef)}
+    protocols = [one for one in classes.values() if "Protocol" in map(ast.unparse, one.bases)]
+    promised = {signature(method) for one in protocols for method in public(one.body) if is_documented(method)}
 
     def inherits(kind: ast.ClassDef, method: str) -> bool:
         for base in map(ast.unparse, kind.bases):
@@ -49,7 +57,8 @@ def missing(trees: dict[str, ast.Module]) -> Iterator[str]:
                 yield f"{place}:{one.lineno}: {one.name}"
             if isinstance(one, ast.ClassDef):
                 for method in public(one.body):
-                    if not is_documented(method) and not inherits(one, method.name):
+                    promise = is_documented(method) or inherits(one, method.name) or signature(method) in promised
+                    if not promise:
                         yield f"{place}:{method.lineno}: {one.name}.{method.name}"
 
 
@@ -65,7 +74,8 @@ def test_every_public_name_has_a_docstring():
 
 
 def test_a_name_without_one_is_found():
-    source = '"""About."""\nclass A:\n    """About."""\n    def f(self): ...\n\nclass B(A):\n    """About."""\n    def f(self): ...\n'
+    method = '    """About."""\n    def f(self): ...\n'
+    source = f'"""About."""\nclass A:\n{method}\nclass B(A):\n{method}'
     assert list(missing({"m.py": ast.parse(source)})) == ["m.py:4: A.f", "m.py:8: B.f"]
     assert not list(missing({"m.py": ast.parse(source.replace("f(self): ...", 'f(self): """It."""', 1))}))
     assert list(missing({"m.py": ast.parse("def f(): ...\ndef _g(): ...")})) == ["m.py: module", "m.py:1: f"]

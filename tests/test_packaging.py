@@ -123,5 +123,6 @@ def test_the_image_installs_the_pinned_versions_and_nothing_else():
 
 
 def test_the_module_is_the_command():
-    done = subprocess.run([sys.executable, "-m", "smartnav_graph", "--version"], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "smartnav_graph", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == f"smartnav {PROJECT['version']}\n"

@@ -16,7 +16,6 @@
 import numpy as np
 import smartnav_graph as sn
 from scipy.spatial.transform import Rotation
-from smartnav_graph.session.streams import Imu
 
 rng = np.random.default_rng(5)
 rate, g = 100.0, 9.80665
@@ -24,7 +23,7 @@ attitude, force_rows, rate_rows = Rotation.identity(), [], []
 TRUE_ACCEL = np.eye(3) + np.array([[0.010, 0.004, -0.003], [0.0, -0.008, 0.005], [0.0, 0.0, 0.012]])
 TRUE_GYRO = np.eye(3) + np.diag([0.006, -0.009, 0.004])
 ACCEL_BIAS, GYRO_BIAS = np.array([0.15, -0.08, 0.11]), np.array([0.002, -0.001, 0.003])
-for k in range(18):
+for _ in range(18):
     for _ in range(int(6 * rate)):
         force_rows.append(attitude.inv().apply([0.0, 0.0, g]))
         rate_rows.append(np.zeros(3))
@@ -40,12 +39,14 @@ force, turning = np.array(force_rows), np.array(rate_rows)
 accel = force @ np.linalg.inv(TRUE_ACCEL).T + ACCEL_BIAS + 0.02 * rng.normal(size=force.shape)
 gyro = turning @ np.linalg.inv(TRUE_GYRO).T + GYRO_BIAS + 0.001 * rng.normal(size=force.shape)
 t_ns = 1_750_000_000_000_000_000 + np.round(np.arange(len(force)) / rate * 1e9).astype(np.int64)
-sn.save(sn.Session(imu=Imu(t_ns=t_ns, accel=accel, gyro=gyro), clock_epoch="unix", gravity_m_s2=g), "rests-and-turns")
+sn.save(
+    sn.Session(imu=sn.Imu(t_ns=t_ns, accel=accel, gyro=gyro), clock_epoch="unix", gravity_m_s2=g), "rests-and-turns"
+)
 
 count = 240_000
 t_ns = 1_750_100_000_000_000_000 + np.arange(count, dtype=np.int64) * 20_000_000
 walk = np.cumsum(3e-7 * rng.normal(size=(count, 3)), axis=0)
-at_rest = Imu(
+at_rest = sn.Imu(
     t_ns=t_ns,
     accel=[0.0, 0.0, g] + 0.02 * rng.normal(size=(count, 3)),
     gyro=GYRO_BIAS + walk + 0.001 * rng.normal(size=(count, 3)),

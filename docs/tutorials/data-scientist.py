@@ -30,31 +30,39 @@ positions.head(3)
 # %% [markdown]
 # ## Build a session
 #
-# Each stream checks its rows when it is made: units by their names, times as whole nanoseconds, no NaN.
+# A session takes tables with the column names of [The session folder](../session-format.md), which carry their unit. The
+# times are the index, datetimes of any unit and time zone. What does not fit is refused with the cure: seconds as
+# floating numbers, a column in another unit, a name that is unknown.
 
 # %%
-from smartnav_graph.core.frames import Origin
-from smartnav_graph.session.streams import GnssFix, Imu
+gyro = {"wx": "gyro_x_rad_s", "wy": "gyro_y_rad_s", "wz": "gyro_z_rad_s"}
+accel = {"ax": "accel_x_m_s2", "ay": "accel_y_m_s2", "az": "accel_z_m_s2"}
+place = {"lat": "lat_deg", "lon": "lon_deg", "height": "height_m"}
 
-session = sn.Session(
-    imu=Imu(
-        t_ns=inertial.index.as_unit("ns").asi8,
-        gyro=inertial[["wx", "wy", "wz"]].to_numpy(),
-        accel=inertial[["ax", "ay", "az"]].to_numpy(),
-    ),
-    gnss=GnssFix(t_ns=positions.index.as_unit("ns").asi8, lla=positions.to_numpy()),
-    origin=Origin(*positions.iloc[0]),
-    clock_epoch="unix",
+session = sn.Session.from_pandas(
+    imu=inertial.rename(columns=gyro | accel),
+    gnss=positions.rename(columns=place),
 )
-{name: len(stream) for name, stream in session.streams().items()}
+session
+
+# %%
+try:
+    sn.Session.from_pandas(imu=inertial)
+except sn.SmartnavError as error:
+    print(error)
 
 # %% [markdown]
+# Arrays work the same way: `sn.Session.from_arrays(imu={"time": ..., "gyro": ..., "accel": ...})`.
+#
 # ## Smooth
 #
 # `sn.smooth` gives a `Solution`. Its arrays have rows = epochs; `to_pandas` makes a table of it.
 
 # %%
 solution = sn.smooth(session, rate="10")
+solution
+
+# %%
 table = solution.to_pandas()
 table[["e_m", "n_m", "u_m", "heading_deg", "sigma_e_m", "sigma_n_m", "sigma_heading_deg"]].iloc[::100].round(3)
 
@@ -90,26 +98,20 @@ rows = pd.DataFrame(
 )
 rows.groupby("sensor").whitened.agg(["count", "mean", "std"]).round(2)
 
-# %% alt="Time series of the whitened residuals of the position fixes, scattered around zero within three sigmas"
-import matplotlib.pyplot as plt
+# %% alt="Path in plan, and height, speed and heading over time with bands of two sigmas"
+_ = solution.plot()
 
-gnss = rows[rows.sensor == "gnss"]
-figure, axes = plt.subplots(figsize=(8, 3))
-axes.plot(gnss.seconds, gnss.whitened, ".")
-axes.set(xlabel="s", ylabel="residual, in sigmas")
-axes.axhline(0.0, color="0.7")
-plt.show()
+# %% alt="Whitened residuals of every sensor over time, scattered around zero, with lines at two sigmas"
+_ = run.plot_residuals()
 
 # %% [markdown]
 # ## Join with your own data
 #
-# Epochs of the solution have integer nanoseconds of the recording's clock. Where that clock is a date they are
-# datetimes, and `merge_asof` joins them with any other table:
+# The index is the time in UTC where the clock of the recording is a date, so `merge_asof` joins it with any other table:
 
 # %%
-at = pd.to_datetime(solution.t_ns, unit="ns", utc=True)
-track = table.set_index(at)[["e_m", "n_m", "sigma_e_m"]]
-events = pd.DataFrame({"event": ["door", "lift"]}, index=at[[120, 400]] + pd.Timedelta("13ms"))
+track = table[["e_m", "n_m", "sigma_e_m"]]
+events = pd.DataFrame({"event": ["bus stop", "lift"]}, index=table.index[[120, 400]] + pd.Timedelta("13ms"))
 pd.merge_asof(events, track, left_index=True, right_index=True, direction="nearest").round(2)
 
 # %% [markdown]
@@ -120,7 +122,7 @@ pd.merge_asof(events, track, left_index=True, right_index=True, direction="neare
 # %%
 sn.save(session, "walk")
 sn.write_run(run, "walk-run", recording=False)
-sorted(p.name for p in __import__("pathlib").Path("walk-run").iterdir())
+pd.read_parquet("walk-run/solution.parquet").shape
 
 # %% [markdown]
 # The columns are on the pages [The session folder](../session-format.md) and

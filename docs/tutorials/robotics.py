@@ -20,22 +20,9 @@ euroc = sn.load("gtsam-euroc")
 run = sn.run(euroc)
 run.summary["mode"], run.summary["verdict"]["level"], round(run.summary["path_m"], 2)
 
-# %% alt="Path of the flight in plan and height over time"
-import matplotlib.pyplot as plt
-
+# %% alt="Path of the flight in plan, and height, speed and heading over time with bands of two sigmas"
 solution = run.solution
-figure, (plan, height) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-plan.plot(*solution.nav_t_body[:, :2].T)
-plan.set(xlabel="east m", ylabel="north m", aspect="equal")
-height.plot(solution.seconds, solution.nav_t_body[:, 2])
-height.fill_between(
-    solution.seconds,
-    solution.nav_t_body[:, 2] - 2 * solution.sigmas[:, 5],
-    solution.nav_t_body[:, 2] + 2 * solution.sigmas[:, 5],
-    alpha=0.3,
-)
-height.set(xlabel="s", ylabel="up m (band: 2 sigma)")
-plt.show()
+_ = solution.plot()
 
 # %% [markdown]
 # ## Replay
@@ -53,9 +40,7 @@ print(f"an update takes {updates['median']:.1f} ms (median), {updates['p99']:.1f
 # How much does the future help? The batch solution serves as reference for the causal one:
 
 # %%
-from smartnav_graph.session.streams import Reference
-
-batch = Reference(t_ns=solution.t_ns, enu=solution.nav_t_body, quat=solution.quat_wxyz)
+batch = sn.Reference(t_ns=solution.t_ns, enu=solution.nav_t_body, quat=solution.quat_wxyz)
 found = sn.evaluate(replay.causal, batch, align="none")
 print(f"causal against batch: {found.ape_m.rmse:.3f} m, {found.rotation_deg.rmse:.2f} deg")
 
@@ -79,8 +64,11 @@ found = sn.evaluate(sn.smooth(room, rate="imu"), room.reference, align="yaw")
 print(f"position {found.ape_m.rmse:.3f} m, attitude {found.rotation_deg.rmse:.2f} deg")
 print({name: round(value, 2) for name, value in found.nees.items() if value is not None})
 
+# %% alt="Errors east, north and up with bands of two sigmas, and the rotation error, over time"
+_ = found.plot()
+
 # %% [markdown]
-# The last line is the consistency (NEES): squared errors over their covariance, 3 on average for three components, 1
+# The last line printed is the consistency (NEES): squared errors over their covariance, 3 on average for three components, 1
 # for yaw, where the covariance is right. One recording is one draw of an error that drifts slowly, so average over several
 # before you conclude anything from it.
 #

@@ -13,11 +13,9 @@
 import dataclasses
 import zipfile
 
-import numpy as np
 import pandas as pd
 from pyproj import Transformer
 
-from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.simulation.fixes import GnssModel
 from smartnav_graph.simulation.scenarios import find_scenario
 
@@ -30,8 +28,8 @@ def table(t_ns, **columns):
 
 
 tables = {
-    "TotalAcceleration.csv": table(made.imu.t_ns, **dict(zip("zyx", made.imu.accel.T[::-1]))),
-    "Gyroscope.csv": table(made.imu.t_ns, **dict(zip("zyx", made.imu.gyro.T[::-1]))),
+    "TotalAcceleration.csv": table(made.imu.t_ns, **dict(zip("zyx", made.imu.accel.T[::-1], strict=True))),
+    "Gyroscope.csv": table(made.imu.t_ns, **dict(zip("zyx", made.imu.gyro.T[::-1], strict=True))),
     "Location.csv": table(
         made.gnss.t_ns,
         altitude=made.gnss.lla[:, 2],
@@ -46,11 +44,23 @@ with zipfile.ZipFile("site-visit.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, rows.to_csv(index=False, float_format="%.9f"))
     archive.writestr("Metadata.csv", "device name,platform\nGalaxy S2,android\n")
 
-stops = {p: i for i, p in enumerate(made.control.point_id)}
-east, north = Transformer.from_crs(4979, 32632, always_xy=True).transform(made.control.lla[:, 1], made.control.lla[:, 0])
-utc = [pd.to_datetime(edge, unit="ns").strftime("%Y-%m-%dT%H:%M:%SZ") for edge in (made.static.t_ns, made.static.t_end_ns)]
+east, north = Transformer.from_crs(4979, 32632, always_xy=True).transform(
+    made.control.lla[:, 1], made.control.lla[:, 0]
+)
+utc = [
+    pd.to_datetime(edge, unit="ns").strftime("%Y-%m-%dT%H:%M:%SZ") for edge in (made.static.t_ns, made.static.t_end_ns)
+]
 points = pd.DataFrame(
-    {"id": made.control.point_id, "start": utc[0], "end": utc[1], "E": east, "N": north, "h": made.control.lla[:, 2], "EPSG": 32632, "sigma": 0.02}
+    {
+        "id": made.control.point_id,
+        "start": utc[0],
+        "end": utc[1],
+        "E": east,
+        "N": north,
+        "h": made.control.lla[:, 2],
+        "EPSG": 32632,
+        "sigma": 0.02,
+    }
 ).round(4)
 points.to_csv("points.csv", index=False)
 
@@ -59,7 +69,9 @@ points.to_csv("points.csv", index=False)
 # ellipsoidal height, and a sigma in metres:
 
 # %%
-print(open("points.csv").read())
+from pathlib import Path
+
+print(Path("points.csv").read_text())
 
 # %% [markdown]
 # ## Import
@@ -132,7 +144,7 @@ table.iloc[::600].round(3)
 # %%
 import json
 
-summary = json.load(open("final/summary.json"))
+summary = json.loads(Path("final/summary.json").read_text())
 print(summary["verdict"]["level"])
 for reason in summary["verdict"]["reasons"]:
     print(f"{reason['sensor']}: {reason['text']}; {reason['remedy']}")

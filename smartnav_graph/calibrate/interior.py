@@ -73,6 +73,7 @@ class Normal(NamedTuple):
 
     @property
     def cost(self) -> float:
+        """Sum of the squared residuals."""
         return float(sum((r**2).sum() for r in self.residuals))
 
 

@@ -47,6 +47,9 @@ class Attitudes:
 
 @dataclass(frozen=True)
 class TurnState:
+    """What turns of images against the gyroscope determine: clock offset (s) and drift of the camera, its attitude
+    body_R_cam (3, 3), the gyroscope bias (3,) rad/s, and the readout of a rolling shutter (s)."""
+
     offset_s: float
     drift: float
     body_R_cam: Floats

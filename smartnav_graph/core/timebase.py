@@ -110,6 +110,7 @@ class Gap:
 
     @property
     def length_s(self) -> float:
+        """Length, s."""
         return (self.end_ns - self.start_ns) / NS
 
 

@@ -121,6 +121,7 @@ class Pass:
 
     @property
     def title(self) -> str:
+        """What is shown as progress."""
         return f"pass {self.number} of at most {self.limit}"
 
 

@@ -65,6 +65,7 @@ class Problem(Summarised):
 
     @property
     def vehicle(self) -> str:
+        """What carries the device: of the options, else of the session."""
         return self.config.run.vehicle or self.session.device.vehicle
 
     def with_dropped(self, reason: str, counts: Mapping[str, int]) -> Problem:

@@ -86,6 +86,7 @@ class Interval:
         )
 
     def to_dict(self) -> dict[str, float | int | str | None]:
+        """As ``smartnav intervals --json`` prints it."""
         return asdict(self)
 
 

@@ -88,6 +88,7 @@ class VehicleAxes:
 
     @classmethod
     def of(cls, mount: Floats) -> VehicleAxes:
+        """Axes and derivatives for pitch and yaw (m, 2 and more) of a mount, rad."""
         sp, cp, sy, cy = np.sin(mount[:, 0]), np.cos(mount[:, 0]), np.sin(mount[:, 1]), np.cos(mount[:, 1])
         o = np.zeros(len(mount))
 
@@ -113,6 +114,7 @@ class DeclaredVelocity:
 
     @classmethod
     def of(cls, R: Floats, v: Floats, body_R_vehicle: Floats) -> DeclaredVelocity:
+        """Velocity in the declared axes, by attitudes R (m, 3, 3) and velocities v (m, 3) in nav; its derivatives."""
         nav_R_vehicle = R @ body_R_vehicle
         vehicle_R_nav = nav_R_vehicle.transpose(0, 2, 1)
         by_state = np.zeros((len(v), 3, 9))

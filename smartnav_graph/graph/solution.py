@@ -72,6 +72,7 @@ class Residuals(Summarised):
 
     @classmethod
     def empty(cls) -> Residuals:
+        """No rows."""
         none = np.zeros(0)
         return cls(
             t_ns=none.astype(np.int64),

@@ -35,6 +35,7 @@ class Window:
 
     @property
     def length_s(self) -> float:
+        """Length, s."""
         return (self.t1_ns - self.t0_ns) / 1e9
 
 

@@ -66,6 +66,7 @@ class StoredRun(Summarised):
 
     @property
     def clock_epoch(self) -> str:
+        """What zero of the clock is; ``unknown`` where the run does not say it."""
         return text_of(table_of(self.summary, "session"), "clock_epoch") or "unknown"
 
     def named(self, name: str) -> Solution:

@@ -48,6 +48,7 @@ def count(value: object) -> str:
 
 
 def seconds(value: object, decimals: int = 1) -> str:
+    """A time with its unit."""
     v = as_float(value)
     return DASH if v is None else f"{fixed(v, decimals)} s"
 
@@ -84,6 +85,7 @@ def listed(parts: Sequence[str]) -> str:
 
 
 def capital(text: str) -> str:
+    """The text with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 

@@ -71,6 +71,7 @@ class UnknownFile:
     columns: str = ""
 
     def one_line(self) -> str:
+        """What was seen, in one line."""
         return "; ".join(self.seen)
 
 

@@ -38,6 +38,7 @@ class SessionValue:
 
     @property
     def sigma(self) -> Floats:
+        """Standard deviation of each component."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 

@@ -86,6 +86,7 @@ class Geometry:
 
     @classmethod
     def of(cls, pairs: Pairs, R: Floats) -> Geometry:
+        """Rays of the matches of pairs, turned by R (n, 3, 3) = c0_R_c1 of each pair."""
         a, b = (rays(x) for x in pairs.matches[:2])
         return cls(a, b @ R.transpose(0, 2, 1), R, pairs.there)
 

@@ -59,9 +59,11 @@ class RotationPrior:
 class ResidualModel(Protocol):
     """Whitened residuals (m, k) with their derivatives (m, k, p), and the state changed by a step (p,)."""
 
-    def rows(self, state: State) -> tuple[Floats, Floats]: ...
+    def rows(self, state: State) -> tuple[Floats, Floats]:
+        """Whitened residuals (m, k) and their derivatives (m, k, d) at a state."""
 
-    def retract(self, state: State, step: Floats) -> State: ...
+    def retract(self, state: State, step: Floats) -> State:
+        """The state moved by a step (d,)."""
 
 
 class MatchedPoints(NamedTuple):

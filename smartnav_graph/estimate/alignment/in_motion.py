@@ -56,6 +56,7 @@ class Curve:
     bias: Floats
 
     def at(self, rows: NDArray[np.intp]) -> Curve:
+        """The same at some of its rows."""
         return replace(self, place=self.place[rows], by=self.by[rows])
 
 
@@ -77,6 +78,7 @@ class Alignment:
 
     @property
     def cost(self) -> float:
+        """Truncated sum of the squared residuals."""
         return gnc.truncated(self.square, LIMIT)
 
 

@@ -81,6 +81,7 @@ class InitialState:
         return replace(self, sentence=self.sentence.replace(was, now), sigma_heading_deg=min(sigma_deg, 180.0))
 
     def to_dict(self) -> dict[str, Any]:
+        """As in summary.json."""
         return {
             "method": self.method,
             "sentence": self.sentence,

@@ -58,6 +58,7 @@ class Seen:
     reading: Floats
 
     def first(self, count: int) -> Seen:
+        """The first `count` rows."""
         return Seen(self.rate[:count], self.force[:count], self.reading[:count])
 
 

@@ -126,6 +126,7 @@ class UpdateLog:
 
     @property
     def latency_ms(self) -> list[float]:
+        """Time of each update, ms."""
         return [row.latency_ms for row in self._rows]
 
     def updates(self) -> Updates:

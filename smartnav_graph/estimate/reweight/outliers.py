@@ -41,6 +41,7 @@ class FixResiduals:
 
     @property
     def square(self) -> Floats:
+        """Squared whitened residuals (m,), summed over the components."""
         return np.asarray(((self.residual / self.sigma) ** 2).sum(axis=1))
 
     @property
@@ -107,6 +108,7 @@ def _by_correlated_error(
 
 
 def position_builders(builders: Iterable[Builder]) -> list[PositionBuilder]:
+    """The builders of position fixes."""
     return [builder for builder in builders if isinstance(builder, PositionBuilder)]
 
 

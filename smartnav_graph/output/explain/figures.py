@@ -62,6 +62,7 @@ class Explanation:
 
     @property
     def t_ns(self) -> int:
+        """Stamp of the keyframe."""
         return int(self.influence.keyframes.t_ns[self.keyframe.place])
 
     def to_dict(self) -> dict[str, object]:

@@ -27,10 +27,12 @@ class Scored(Protocol):
     """Errors at the withheld rows of one sensor: `t_ns` (n,) and `error` (n, 3) m, nav axes."""
 
     @property
-    def t_ns(self) -> Times: ...
+    def t_ns(self) -> Times:
+        """Stamps (n,) ns."""
 
     @property
-    def error(self) -> Floats: ...
+    def error(self) -> Floats:
+        """Errors (n, 3) m, east, north, up."""
 
 
 MOST_FAR = 6.0  # whitened residuals beyond are drawn at the edge and counted
@@ -51,6 +53,7 @@ def grid(figures: Sequence[str]) -> str:
 
 
 def time_of(solution: Solution) -> Axis:
+    """The time axis of a solution."""
     t = solution.seconds
     return time_axis(float(t[0]), float(t[-1]))
 

@@ -49,6 +49,7 @@ class Axis:
 
 
 def finite_values(values: ArrayLike) -> Floats:
+    """The values that are finite, in one row."""
     v = np.asarray(values, dtype=np.float64).ravel()
     return v[np.isfinite(v)]
 

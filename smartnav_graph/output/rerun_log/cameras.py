@@ -39,6 +39,7 @@ class CameraView:
 
     @property
     def image(self) -> str:
+        """Entity of the image."""
         return f"{self.root}/image"
 
     @property

@@ -38,6 +38,7 @@ class GraphDrawing:
     edges: list[tuple[str, str]] = field(default_factory=list)
 
     def node(self, name: str, label: str, place: tuple[float, float], color: list[int]) -> None:
+        """Add a node with its label, place and colour."""
         self.ids.append(name)
         self.labels.append(label)
         self.places.append(place)

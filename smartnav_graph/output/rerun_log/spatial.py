@@ -41,6 +41,7 @@ class Extent:
 
     @property
     def centre(self) -> Floats:
+        """Centre (3,) m, as drawn."""
         return np.asarray((self.low + self.high) / 2 - self.shift)
 
     @property

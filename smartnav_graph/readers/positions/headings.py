@@ -59,6 +59,7 @@ class PositionTable:
 
     @property
     def path(self) -> Path:
+        """The file."""
         return self.table.path
 
     def floats(self, role: str) -> Floats | None:

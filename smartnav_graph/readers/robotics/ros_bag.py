@@ -142,14 +142,17 @@ class Topic:
 
     @property
     def t_ns(self) -> Times:
+        """Stamps (n,) ns of the headers."""
         return np.frombuffer(self._stamps, dtype=np.int64)
 
     @property
     def log_ns(self) -> Times:
+        """Times (n,) ns at which the messages were recorded."""
         return np.frombuffer(self._logged, dtype=np.int64)
 
     @property
     def values(self) -> Floats:
+        """Values (n, columns) of the messages."""
         return np.frombuffer(self._values, dtype=np.float64).reshape(len(self), -1)
 
     @property

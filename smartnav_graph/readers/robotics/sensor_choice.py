@@ -15,9 +15,12 @@ class LogSensor(Protocol):
     """One sensor of a log: its name in the log, and how many rows a second it has."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What the log calls it."""
+
     @property
-    def rate_hz(self) -> float: ...
+    def rate_hz(self) -> float:
+        """Rows a second."""
 
 
 P = TypeVar("P", bound=LogSensor)

@@ -89,6 +89,7 @@ class FixTrack:
 
     @cached_property
     def spacing_s(self) -> float:
+        """Median time between fixes, s."""
         return float(np.median(np.diff(self.t)))
 
     def chords(self, every: int) -> tuple[Floats, Floats, Complexes]:

@@ -47,6 +47,7 @@ class InertialMotion:
 
     @property
     def length_s(self) -> float:
+        """Length, s."""
         return len(self.heading) * STEP_S
 
 

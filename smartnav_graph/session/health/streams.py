@@ -41,6 +41,7 @@ def _rows(facts: Facts) -> Iterator[Finding]:
 
 
 def dropped(facts: Facts) -> Iterator[Finding]:
+    """Rows that were left out, by stream and reason."""
     for name, counts in facts.session.dropped.items():
         yield Finding(name, ", ".join(f"{count} {reason}" for reason, count in counts.items()), level="info")
 
