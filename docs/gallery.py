@@ -43,7 +43,7 @@ def report(run, name):
     Path(name).write_bytes(Path("run/report.html").read_bytes())
 
 
-# %% alt="Path of the car of 3.7 km with the fixes, its speed, and the horizontal sigma over time"
+# %% tags=["fold"] alt="Path of the car of 3.7 km with the fixes, its speed, and the horizontal sigma over time"
 kitti = sn.load("gtsam-kitti")
 drive = sn.run(kitti, withhold=("gnss:every=10",))
 draw(drive, "One fix in ten", kitti.nav_position(kitti.gnss), name="gallery-kitti.png")
@@ -57,7 +57,7 @@ print("withheld fixes:", {k: round(v, 3) for k, v in drive.summary["withheld"]["
 #
 # One minute with the noise of a phone of 2011: magnetometer, barometer, fixes of 3 m.
 
-# %% alt="Path of the walk with scattered fixes, speed, and sigma over time"
+# %% tags=["fold"] alt="Path of the walk with scattered fixes, speed, and sigma over time"
 walk = sn.simulate("walk-60s", 2)
 walked = sn.run(walk, rate="10")
 draw(walked, "A walk of one minute", walk.nav_position(walk.gnss))
@@ -70,7 +70,7 @@ report(walked, "gallery-walk.html")
 #
 # No satellites: inertial data, standstills, nine visits of surveyed points.
 
-# %% alt="Path of the trolley through the control points; between them the sigma rises and falls back at each point"
+# %% tags=["fold"] alt="Path of the trolley through the control points; between them the sigma rises and falls back at each point"
 loop = sn.simulate("trolley-loop", 1)
 pushed = sn.run(loop, rate="10")
 draw(pushed, "A trolley, four rounds", points=loop.nav_position(loop.control))
@@ -83,7 +83,7 @@ report(pushed, "gallery-trolley.html")
 #
 # EuRoC V1_01 from GTSAM: inertial data and feature tracks, no positions at all.
 
-# %% alt="Path of the flight indoors, speed, and the sigma that grows with the distance from the start"
+# %% tags=["fold"] alt="Path of the flight indoors, speed, and the sigma that grows with the distance from the start"
 flight = sn.run(sn.load("gtsam-euroc"))
 draw(flight, "Visual-inertial odometry")
 report(flight, "gallery-flight.html")
@@ -95,7 +95,7 @@ report(flight, "gallery-flight.html")
 #
 # The first 200 s of the drive, the clock of its receiver three seconds off. The verdict says so:
 
-# %%
+# %% tags=["fold"]
 from dataclasses import replace
 
 wrong = kitti.replace(gnss=replace(kitti.gnss, t_ns=kitti.gnss.t_ns + 3_000_000_000))

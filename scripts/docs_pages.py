@@ -38,6 +38,7 @@ from smartnav_graph.session.stream import Stream
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+WARNING = re.compile(r"(?m)^\S+\.py:\d+: (\w*Warning: .*)\n  .*$")
 CELL_SECONDS = 240
 FIRST = ("load", "smooth", "run", "Session", "Solution", "Run")
 _made = dict[tuple[str, str], dict[str, str | bytes]]()
@@ -123,7 +124,7 @@ def shown_code(cell: nbformat.NotebookNode) -> str:
     fence = f"```{'bash' if shell else 'python'}\n{code}\n```"
     if "fold" not in cell.metadata.get("tags", ()):
         return fence
-    return '??? example "How the files of this page were made"\n\n' + textwrap.indent(fence, "    ")
+    return f'??? example "{cell.metadata.get("title", "Code")}"\n\n' + textwrap.indent(fence, "    ")
 
 
 def run(notebook: nbformat.NotebookNode, folder: Path, source: Path) -> None:
@@ -157,7 +158,7 @@ def outputs(cell: nbformat.NotebookNode, alternative: str) -> Iterator[str | tup
         elif "text/html" in data:
             table = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
             yield f'<div class="output" tabindex="0" role="region" aria-label="output">{table}</div>'
-        elif text := CONTROL.sub("", data["text/plain"]).rstrip():
+        elif text := WARNING.sub(r"\1", CONTROL.sub("", data["text/plain"])).rstrip():
             yield f'```text title="Output"\n{text}\n```'
 
 

@@ -11,7 +11,7 @@
 # | at rest | an hour or more on a table | noise densities, bias instability |
 # | pictures of a board | twenty pictures of a printed board from all sides | camera |
 
-# %% tags=["fold"]
+# %% tags=["fold"] title="How the files of this page were made"
 # The recordings, simulated with errors that we know: scale 1 %, misalignment half a degree, bias 0.15 m/s^2.
 import numpy as np
 import smartnav_graph as sn

@@ -4,7 +4,7 @@
 # The samples are in tables: inertial data of some device at 100 Hz, and positions once a second. Wanted: one table with
 # position, velocity and attitude at any rate, each with its sigma.
 
-# %% tags=["fold"]
+# %% tags=["fold"] title="How the files of this page were made"
 # Two tables with names of their own, as they come from a database: a walk of one minute with a phone.
 import numpy as np
 import pandas as pd

@@ -4,7 +4,7 @@
 # No satellites, no points: ten seconds with a phone in a room, its pictures and its inertial data. Pictures hold the
 # rotation and the direction of travel, inertial data their scale.
 
-# %% tags=["fold"]
+# %% tags=["fold"] title="How the files of this page were made"
 # A recording with pictures, rendered from a simulated room; with its truth in reference.parquet.
 from dataclasses import replace
 from pathlib import Path

@@ -72,4 +72,7 @@ _ = found.plot()
 # for yaw, where the covariance is right. One recording is one draw of an error that drifts slowly, so average over several
 # before you conclude anything from it.
 #
-# INSERT-FACTOR
+# ## A factor of your own
+#
+# Measurements that the package does not know are added from a package of your own, without a change here: see the page
+# on factors and readers of other packages under [How to](../how-to/index.md).

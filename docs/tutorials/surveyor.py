@@ -8,7 +8,7 @@
 # You need two files: the export of the phone's logging app as it comes (here a zip of Sensor Logger), and a list of
 # the points.
 
-# %% tags=["fold"]
+# %% tags=["fold"] title="How the files of this page were made"
 # The two files of this tutorial, made from a simulated recording: 6 min, receiver noise 3 m with a correlated error.
 import dataclasses
 import zipfile
@@ -108,7 +108,7 @@ withheld[[c for c in withheld if c not in ("t_ns", "arrival_ns")]].round(3)
 # %%
 # !smartnav smooth visit --out final --vehicle trolley --rate 10 --quiet
 
-# %% alt="Map of the path of the trolley in UTM coordinates with the fixes of the receiver scattered metres around it and the control points on it" tags=["figure"]
+# %% alt="Map of the path of the trolley in UTM coordinates with the fixes of the receiver scattered metres around it and the control points on it"
 import matplotlib.pyplot as plt
 from pyproj import Transformer
 
