@@ -15,6 +15,8 @@ _DATE = re.compile(
     re.IGNORECASE,
 )
 
+YEARS = (1700, 2250)  # whose nanoseconds since 1970 are numbers of 64 bits
+
 
 def ns_from_date(text: str) -> int:
     """Unix nanoseconds of a date such as ``2023-12-31T22:33:02.400Z`` or ``2018-08-03 20:47:12:853``.
@@ -32,7 +34,7 @@ def ns_from_date(text: str) -> int:
             raise ValueError
         year, month, day, hour, minute, second, fraction, zone = found.groups()
         days = int(np.datetime64(f"{year}-{month}-{day}", "D").astype(np.int64))
-        if int(hour) > 24 or int(minute) > 59 or int(second) > 60:
+        if not YEARS[0] <= int(year) <= YEARS[1] or int(hour) > 24 or int(minute) > 59 or int(second) > 60:
             raise ValueError
     except ValueError as error:
         raise SessionError("time stamp", f"{text!r} is no date", "such as 2023-12-31T22:33:02.400Z") from error

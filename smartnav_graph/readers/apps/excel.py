@@ -27,7 +27,7 @@ def is_excel(path: Path) -> bool:
             return False
         with zipfile.ZipFile(path) as archive:
             return "xl/workbook.xml" in archive.namelist()
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except (OSError, ValueError, RuntimeError, zipfile.BadZipFile):  # RuntimeError: a version of zip to come
         return False
 
 

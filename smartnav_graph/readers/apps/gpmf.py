@@ -43,8 +43,9 @@ class Item:
             No numbers, or not a whole number of rows.
         """
         letters = kinds if self.kind == "?" else self.kind * (self.size // max(_width(self.kind), 1))
-        row = np.dtype([(f"_{i}", _TYPES[letter]) for i, letter in enumerate(letters)]) if letters else None
-        if row is None or any(letter not in _TYPES for letter in letters) or row.itemsize != self.size:
+        known = letters and all(letter in _TYPES for letter in letters)
+        row = np.dtype([(f"_{i}", _TYPES[letter]) for i, letter in enumerate(letters)]) if known else None
+        if row is None or row.itemsize != self.size:
             raise ValueError(f"{self.key} has values of type {self.kind!r} and {self.size} bytes")
         rows = np.frombuffer(self.data, dtype=row)
         return np.stack([rows[name].astype(np.float64) for name in row.names or ()], axis=-1)

@@ -19,6 +19,7 @@ from smartnav_graph.core.timebase import NS
 from smartnav_graph.readers.fixes import RADIUS_68, LoggedFixes, unmarked
 from smartnav_graph.readers.positions.track import RANGE_ERROR_M, session_of_fixes
 from smartnav_graph.readers.source import Reader, first_bytes
+from smartnav_graph.readers.stamps import YEARS
 from smartnav_graph.readers.text import read_bytes
 from smartnav_graph.session.session import Session
 
@@ -42,7 +43,11 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     if not points:
         found = f"holds no point with a time ({len(every)} track points)"
         raise SessionError(path, found, "track points with <time>", "give a list of places as control points (CSV)")
-    t_ns = np.array([_nanoseconds(point.time) for point in points if point.time is not None], dtype=np.int64)
+    times = [point.time for point in points if point.time is not None]
+    if others := [row for row, time in enumerate(times) if not YEARS[0] <= time.year <= YEARS[1]]:
+        found = f"time is {times[others[0]].isoformat()} at row {others[0]} ({len(others)} such points in all)"
+        raise SessionError(path, found, f"years {YEARS[0]} to {YEARS[1]}", "correct the point", row=others[0])
+    t_ns = np.array([_nanoseconds(time) for time in times], dtype=np.int64)
     place = [(p.latitude, p.longitude, p.elevation, p.geoid_height) for p in points]
     lla = np.array([[np.nan if value is None else value for value in row] for row in place], dtype=np.float64)
     geoid = lla[:, 3]

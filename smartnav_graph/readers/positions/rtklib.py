@@ -19,11 +19,13 @@ from smartnav_graph.core.timebase import NS, ns_from_texts
 from smartnav_graph.readers.fixes import LoggedFixes
 from smartnav_graph.readers.positions.track import session_of_fixes
 from smartnav_graph.readers.source import Reader, first_bytes
+from smartnav_graph.readers.stamps import YEARS
 from smartnav_graph.readers.text import read_bytes
 from smartnav_graph.session.session import Session
 
 _HEADING = re.compile(rb"^%\s+(GPST|UTC|JST)[ ,]+(latitude|x-ecef|e-baseline)", re.MULTILINE)
 _TIME_OF_DAY = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)")
+_MOST_WEEKS = 10_000
 _GPS_EPOCH_NS = int(np.datetime64("1980-01-06", "ns").astype(np.int64))
 _JST_NS = 9 * 3600 * NS
 _PLACES = {"lla": ("latitude(deg)", "longitude(deg)", "height(m)"), "ecef": ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)")}
@@ -94,7 +96,11 @@ def _times(path: Path, stamps: list[tuple[str, str]], system: str) -> Times:
     first, second = [day for day, _ in stamps], [time for _, time in stamps]
     try:
         if "/" in first[0]:
-            days = np.array([day.replace("/", "-") for day in first], dtype="datetime64[D]").astype("datetime64[ns]")
+            dates = np.array([day.replace("/", "-") for day in first], dtype="datetime64[D]")
+            years = dates.astype("datetime64[Y]").astype(np.int64) + 1970
+            if not ((years >= YEARS[0]) & (years <= YEARS[1])).all():
+                raise ValueError(f"years {years.min()} to {years.max()}")
+            days = dates.astype("datetime64[ns]")
             clock = [found for text in second if (found := _TIME_OF_DAY.fullmatch(text)) is not None]
             if len(clock) < len(second):
                 raise ValueError(next(text for text in second if not _TIME_OF_DAY.fullmatch(text)))
@@ -102,7 +108,10 @@ def _times(path: Path, stamps: list[tuple[str, str]], system: str) -> Times:
             t_ns = days.astype(np.int64) + minutes * 60 * NS + ns_from_texts([m[3] for m in clock])
             gps_ns = t_ns - _GPS_EPOCH_NS
         else:
-            gps_ns = np.array(first, dtype=np.int64) * 604_800 * NS + ns_from_texts(second)
+            weeks = np.array(first, dtype=np.int64)
+            if not ((weeks >= 0) & (weeks < _MOST_WEEKS)).all():
+                raise ValueError(f"weeks {weeks.min()} to {weeks.max()}")
+            gps_ns = weeks * 604_800 * NS + ns_from_texts(second)
             t_ns = gps_ns + _GPS_EPOCH_NS
     except (ValueError, SessionError) as error:
         raise SessionError(path, f"a time is not readable ({error})", "yyyy/mm/dd hh:mm:ss or week seconds") from error
