@@ -254,6 +254,8 @@ def of_columns(path: Path, rng: random.Random) -> None:
         table["t_ns"] = table["t_ns"] // rng.choice([10**3, 10**6, 10**9])
     elif kind == 5:
         table["t_ns"] = table["t_ns"].where(table.index < row, table["t_ns"] + 10 ** rng.randrange(12, 19))
+    elif not pd.api.types.is_numeric_dtype(table[column]):
+        table[column] = [rng.choice(CELLS) if i == row else text for i, text in enumerate(table[column])]
     else:
         table[column] = table[column].astype(float)
         table.loc[table.index[row], column] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e7, 0.5])
