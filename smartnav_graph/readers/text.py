@@ -97,9 +97,13 @@ class TextTable:
                 f"the file has {', '.join(self.cells)}; rename or add the column",
             )
 
+    def _column(self, name: str) -> pa.ChunkedArray:
+        self.require([name])
+        return self.cells[name]
+
     def where(self, name: str, value: str) -> TextTable:
         """The rows whose cell in column `name` reads `value`."""
-        return self.rows(pa.compute.equal(self.cells[name], value))
+        return self.rows(pa.compute.equal(self._column(name), value))
 
     def rows(self, mask: Mask | pa.ChunkedArray) -> TextTable:
         """The rows of a mask (n,)."""
@@ -108,11 +112,11 @@ class TextTable:
 
     def known(self, name: str) -> Mask:
         """Mask (n,) of the rows whose cell holds something, be it no number."""
-        return np.asarray(_filled(self.cells[name]).is_valid().to_numpy(), dtype=bool)
+        return np.asarray(_filled(self._column(name)).is_valid().to_numpy(), dtype=bool)
 
     def texts(self, name: str) -> Texts:
         """Cells as text (object array); empty where empty."""
-        return np.array(self.cells[name].to_pylist(), dtype=object)
+        return np.array(self._column(name).to_pylist(), dtype=object)
 
     def floats(self, *names: str) -> Floats:
         """One column (n,) or several (n, k) as numbers; empty cells, and marks such as N/A, become NaN.
@@ -147,7 +151,7 @@ class TextTable:
     def times(self, name: str, unit_ns: int = NS) -> Times:
         """One column of decimal clock readings in units of `unit_ns` as exact nanoseconds; dates as Unix nanoseconds
         (`stamps.ns_from_date`)."""
-        cells = self.cells[name]
+        cells = self._column(name)
         dates = len(cells) > 0 and is_date(cells[0].as_py())
         if not dates and len(cells) and "," in cells[0].as_py():
             cells = self._with_point(name, cells)
@@ -166,7 +170,7 @@ class TextTable:
         return not self.known(name).any()
 
     def _numbers(self, name: str, kind: pa.DataType, what: str = "a number") -> pa.ChunkedArray:
-        cells = self.cells[name]
+        cells = self._column(name)
         try:
             return _cast(cells, kind)
         except pa.ArrowInvalid:
@@ -197,7 +201,7 @@ class TextTable:
         return pa.compute.replace_substring(cells, ",", ".", max_replacements=1)
 
     def _bad_cell(self, name: str, row: int, expected: str) -> SessionError:
-        found = f"{name} is {self.cells[name][row].as_py()!r} at row {row}"
+        found = f"{name} is {self._column(name)[row].as_py()!r} at row {row}"
         return SessionError(self.path, found, expected, "correct the cell, or leave it empty if unknown", row=row)
 
 

@@ -13,7 +13,6 @@ import contextlib
 import hashlib
 import importlib
 import json
-import logging
 import os
 import random
 import shutil
@@ -22,6 +21,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -216,7 +216,7 @@ def strike(folder: Path, name: str, kind: str, rng: random.Random) -> list[str]:
         faults += [f"left {left}"] if left else []
     else:
         before = content(out)
-        logging.disable()
+        warnings.simplefilter("ignore")
         tables = [out / f"matches{end}" for end in (".parquet", ".toml")] if name == "match" else []
         for target in [out, *tables]:
             with contextlib.suppress(KeyboardInterrupt), replacing(target):

@@ -1,5 +1,6 @@
 """What fuzzing found: inputs that once ended in another error than a named one."""
 
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -36,6 +37,12 @@ FINDINGS = {
             "time,latitude,longitude\n2025-06-01T12:00:00Z,52.5,11\n9025-06-01T12:00:01Z,52.5,11\n"
         ),
         "at row 1",
+    ),
+    "sensors.txt": (
+        lambda path: exports.gnss_logger(path).write_text(
+            re.sub("# Accel,utc.*", "# Accel,utcTimeMillis,elapsedRealtimeNanos,a,b,c", path.read_text())
+        ),
+        "Accel has columns utctimemillis, elapsedrealtimenanos, a, b, c",
     ),
     "late.pos": (
         lambda path: path.write_text(

@@ -137,6 +137,8 @@ def _boot_to_unix(log: _Log, fixes: TextTable | None) -> int:
         for kind in kinds:
             if kind in log.rows:
                 table = log.table(kind)
+                if not {"elapsedrealtimenanos", "utctimemillis"} <= set(table.cells):
+                    continue
                 table = table.rows(table.known("elapsedrealtimenanos") & table.known("utctimemillis"))
                 if len(table):
                     return clock_offset(table.times("elapsedrealtimenanos", 1), table.times("utctimemillis", _MS))
@@ -160,7 +162,11 @@ def _vector(log: _Log, kinds: tuple[str, str], offset: int, repairs: tuple[str, 
     readings = [axes.get(f"{found[0].lower()}{axis}") for axis in "xyz"]
     biases = [axes.get(f"bias{axis}", axes.get(f"drift{axis}")) for axis in "xyz"]
     columns = [name for name in readings if name is not None]
-    if len(table) < 2 or len(columns) < 3:
+    if len(columns) < 3:
+        raise SessionError(
+            log.path, f"{found[0]} has columns {', '.join(table.cells)}", "X, Y and Z", "export it again"
+        )
+    if len(table) < 2:
         return None
     values = table.floats(*columns)
     if None not in biases:
