@@ -29,9 +29,9 @@ simulate rendered-room-10s --seed 1 --out room
 match room --force
 degrade walk --gnss-white 3 --out worse
 replay walk --to 12 --out causal
-intervals walk --to 20 --every 5 --reference walk
+intervals walk --to 45 --every 10 --reference walk
 compare run causal --out both.rrd
-calibrate clock walk
+calibrate clock walk --out clock.toml
 demo --out demo
 """
 CALLS = "trace=%network,open,openat,creat,mkdir,mkdirat,rename,renameat,renameat2,unlink,unlinkat,symlink,link,truncate"

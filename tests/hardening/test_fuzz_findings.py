@@ -25,6 +25,12 @@ def zip_of_a_later_version(path):
     path.write_bytes(data)
 
 
+def sensors_of_other_columns(path):
+    exports.gnss_logger(path)
+    names = "# Accel,utcTimeMillis,elapsedRealtimeNanos,a,b,c"
+    path.write_text(re.sub("# Accel,utc.*", names, path.read_text()))
+
+
 FINDINGS = {
     "log.zip": (zip_of_a_later_version, "cannot be unpacked"),
     "scale.raw": (
@@ -38,12 +44,7 @@ FINDINGS = {
         ),
         "at row 1",
     ),
-    "sensors.txt": (
-        lambda path: exports.gnss_logger(path).write_text(
-            re.sub("# Accel,utc.*", "# Accel,utcTimeMillis,elapsedRealtimeNanos,a,b,c", path.read_text())
-        ),
-        "Accel has columns utctimemillis, elapsedrealtimenanos, a, b, c",
-    ),
+    "sensors.txt": (sensors_of_other_columns, "Accel has columns utctimemillis, elapsedrealtimenanos, a, b, c"),
     "late.pos": (
         lambda path: path.write_text(
             "% program : RTKPOST\n%  GPST latitude(deg) longitude(deg) height(m) Q ns\n"
