@@ -9,6 +9,7 @@ from __future__ import annotations
 import lzma
 import shutil
 import stat
+import struct
 import tarfile
 import tempfile
 import zipfile
@@ -27,6 +28,9 @@ _FAULTS = (
     EOFError,
     ValueError,
     RuntimeError,
+    LookupError,
+    ArithmeticError,
+    struct.error,
     zipfile.BadZipFile,
     tarfile.TarError,
     zlib.error,

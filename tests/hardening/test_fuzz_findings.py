@@ -31,8 +31,15 @@ def sensors_of_other_columns(path):
     path.write_text(re.sub("# Accel,utc.*", names, path.read_text()))
 
 
+def zip_without_a_name(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("name", "t,x\n0,1\n")
+    path.write_bytes(path.read_bytes().replace(b"name", b"\0ame"))
+
+
 FINDINGS = {
     "log.zip": (zip_of_a_later_version, "cannot be unpacked"),
+    "nameless.zip": (zip_without_a_name, "cannot be unpacked"),
     "scale.raw": (
         lambda path: path.write_bytes(exports.gopro_payload(0).replace(b"SCALs", b"SCALm") * 4),
         "SCAL has values of type 'm'",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ def is_excel(path: Path) -> bool:
             return False
         with zipfile.ZipFile(path) as archive:
             return "xl/workbook.xml" in archive.namelist()
-    except (OSError, ValueError, RuntimeError, zipfile.BadZipFile):  # RuntimeError: a version of zip to come
+    except (OSError, ValueError, RuntimeError, LookupError, struct.error, zipfile.BadZipFile):
         return False
 
 
