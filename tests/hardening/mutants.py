@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import tomli_w
@@ -139,21 +138,6 @@ def foot(path: Path) -> Path:
     return path / "foot.mat"
 
 
-def kitti(path: Path) -> Path:
-    """20 pictures of an odometry sequence, a metre ahead from one to the next, which turns to the right."""
-    root, count = path / "sequence", 20
-    (root / "image_0").mkdir(parents=True)
-    for i in range(count):
-        cv2.imwrite(str(root / "image_0" / f"{i:06d}.png"), np.full((8, 12), 100 + i, np.uint8))
-    angle = 0.05 * np.arange(count)
-    c, s, x, z = np.cos(angle), np.sin(angle), np.cumsum(np.sin(angle)), np.cumsum(np.cos(angle))
-    poses = [f"{c[i]:.9f} 0 {s[i]:.9f} {x[i]:.6f} 0 1 0 0 {-s[i]:.9f} 0 {c[i]:.9f} {z[i]:.6f}" for i in range(count)]
-    (root / "poses.txt").write_text("\n".join(poses) + "\n")
-    (root / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(count)))
-    (root / "calib.txt").write_text("P0: 7.0e+02 0 6.0 0 0 7.1e+02 4.0 0 0 0 1 0\nP1: 7e2 0 6 -386 0 7e2 4 0 0 0 1 0\n")
-    return root
-
-
 def exported(name: str) -> Callable[[Path], Path]:
     file, write = EXPORTS[name]
     return lambda path: Path(write(path / file))
@@ -200,7 +184,6 @@ BASES: dict[str, Base] = {
     "tum": Base(text_base("truth.tum", tum), lambda p: (repr(load_reference(p)), [])),
     "comma2k19": Base(comma, read_session),
     "foot": Base(foot, read_session),
-    "kitti-odometry": Base(kitti, read_session),
     **{name: Base(exported(name), read_session) for name in EXPORTS},
 }
 

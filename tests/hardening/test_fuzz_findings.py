@@ -44,6 +44,10 @@ FINDINGS = {
         lambda path: path.write_bytes(exports.gopro_payload(0).replace(b"SCALs", b"SCALm") * 4),
         "SCAL has values of type 'm'",
     ),
+    "few.raw": (
+        lambda path: path.write_bytes(exports.gopro_payload(0).replace(b"GPS5", b"GPS9") * 4),
+        "GPS9 has 5 columns, not 9",
+    ),
     "old.gpx": (lambda path: path.write_text(GPX.format(POINT.format(1012))), "time is 1012-06-01T12:00:00.* at row 0"),
     "late.csv": (
         lambda path: path.write_text(

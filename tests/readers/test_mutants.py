@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -39,8 +40,24 @@ def euroc(folder):
     return folder
 
 
+def kitti(root):
+    """Pictures of an odometry sequence, a metre ahead from one to the next, which turns to the right."""
+    count = 6
+    (root / "image_0").mkdir(parents=True)
+    for i in range(count):
+        cv2.imwrite(str(root / "image_0" / f"{i:06d}.png"), np.full((8, 12), 100 + i, np.uint8))
+    angle = 0.05 * np.arange(count)
+    c, s, x, z = np.cos(angle), np.sin(angle), np.cumsum(np.sin(angle)), np.cumsum(np.cos(angle))
+    poses = [f"{c[i]:.9f} 0 {s[i]:.9f} {x[i]:.6f} 0 1 0 0 {-s[i]:.9f} 0 {c[i]:.9f} {z[i]:.6f}" for i in range(count)]
+    lines(root / "poses.txt", poses)
+    lines(root / "times.txt", [f"{0.1 * i:.6e}" for i in range(count)])
+    lines(root / "calib.txt", ["P0: 7.0e+02 0 6.0 0 0 7.1e+02 4.0 0 0 0 1 0", "P1: 7e2 0 6 -386 0 7e2 4 0 0 0 1 0"])
+    return root
+
+
 EXPORTS = {
     **APPS,
+    "kitti-odometry": ("sequence", kitti),
     "wide-csv": ("log.csv", wide),
     "euroc": ("V1_01", euroc),
 }
@@ -162,8 +179,12 @@ LATER_NS = 60_000_000  # of a fix in every row, the first of which is missing
 # A byte among the numbers of a binary file may be any: nothing shows that it is another.
 BINARY = dict.fromkeys(("gopro", "matlab-mobile"), ("cut", "zeros", "empty", "noise", "mark"))
 # Names and readings of these have other places in their lines: an exchange would give readings other names.
+# Poses of other pictures, or other axes of a place, are poses too.
+POSES = {"kitti-odometry": tuple(name for name in MUTATIONS if name not in ("swapped columns", "swapped lines"))}
 PREFIXED = dict.fromkeys(("gnss-logger", "flysight"), tuple(name for name in MUTATIONS if name != "swapped columns"))
-CASES = [(name, mutation) for name in EXPORTS for mutation in {**BINARY, **PREFIXED}.get(name, tuple(MUTATIONS))]
+CASES = [
+    (name, mutation) for name in EXPORTS for mutation in {**BINARY, **PREFIXED, **POSES}.get(name, tuple(MUTATIONS))
+]
 
 
 @pytest.mark.parametrize(("name", "mutation"), CASES)
@@ -210,6 +231,12 @@ def check_mutant(name, mutation, seed, folder):
         return
     if session.gnss is not None and original.gnss is not None:
         check_fixes(session, original, f"{name}, {mutation} {seed} of {mutated.name}")
+    if original.reference is not None:
+        same = [
+            getattr(session.reference, name) == getattr(original.reference, name) for name in ("t_ns", "enu", "quat")
+        ]
+        assert all(part.all() for part in same) and (session.images.t_ns == original.images.t_ns).all()
+        assert session.calibration == original.calibration
     if session.imu is None:
         return
     assert len(session.imu) <= len(original.imu), mutation
@@ -235,3 +262,45 @@ def test_one_sensor_missing(tmp_path, name):
             assert "there is no" in str(session.dropped["imu"]) and len(session.gnss)
             continue
         assert np.allclose(session.imu.accel, ACCEL, atol=1e-6) and np.allclose(session.imu.gyro, GYRO, atol=1e-9)
+
+
+TEXTS = [name for name in EXPORTS if name not in BINARY]
+
+
+def spoilt(name, folder, file, row, column):
+    """The error of an export in which one cell is no number; None where it is read."""
+    source = EXPORTS[name][1](folder / EXPORTS[name][0])
+    path = source if source.is_file() else source / file
+    rows = path.read_text(encoding="utf-8").splitlines()
+    mark = "," if rows[row].count(",") else " "
+    cells = rows[row].split(mark)
+    cells[column] = "x7"
+    rows[row] = mark.join(cells)
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return attempt(source)[1]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_the_row_that_is_named_is_that_of_the_fault(tmp_path, name):
+    """The row named moves with the fault: by as many rows of its kind as lie between."""
+    source = EXPORTS[name][1](tmp_path / "whole" / EXPORTS[name][0])
+    named = 0
+    for path in [f for f in files_of(source) if f.suffix in (".csv", ".CSV", ".txt")]:
+        rows = path.read_text(encoding="utf-8").splitlines()
+        kinds = [row.split(",")[0] if row[:1].isalpha() or row[:1] == "$" else "" for row in rows]
+        if len(rows) < 6:
+            continue
+        kind = max(set(kinds[len(rows) // 3 :]), key=kinds.count)
+        own = [i for i, k in enumerate(kinds) if k == kind]
+        first, second = own[len(own) // 2], own[-2]
+        file = "" if source.is_file() else path.relative_to(source)
+        for column in range(len(rows[first].split("," if "," in rows[first] else " "))):
+            errors = [
+                spoilt(name, tmp_path / f"{path.stem} {column} {row}", file, row, column) for row in (first, second)
+            ]
+            places = [re.search(r"\b(?:row|record|line) #?(\d+)", error) for error in errors]
+            if all(places):
+                apart = own.index(second) - own.index(first)
+                assert int(places[1][1]) - int(places[0][1]) == apart, errors
+                named += 1
+    assert named

@@ -51,6 +51,9 @@ class _Stream:
         return np.repeat(of_payload, [len(rows) for rows in self.values])
 
 
+_COLUMNS = {"ACCL": 3, "GYRO": 3, "MAGN": 3, "GPS5": 5, "GPS9": 9}
+
+
 def _parse(path: Path, found: list[bytes]) -> tuple[dict[str, _Stream], str]:
     streams: dict[str, _Stream] = {}
     device = ""
@@ -70,10 +73,12 @@ def _parse(path: Path, found: list[bytes]) -> tuple[dict[str, _Stream], str]:
 def _add(streams: dict[str, _Stream], index: int, items: list[Item]) -> None:
     """The values of one stream of a payload, if it is known."""
     known = {item.key: item for item in items}
-    data = next((item for item in items if item.key in ("ACCL", "GYRO", "MAGN", "GPS5", "GPS9")), None)
+    data = next((item for item in items if item.key in _COLUMNS), None)
     if data is None or not data.data:
         return
     values = data.numbers(known["TYPE"].text() if "TYPE" in known else "")
+    if values.shape[1] < _COLUMNS[data.key]:
+        raise ValueError(f"{data.key} has {values.shape[1]} columns, not {_COLUMNS[data.key]}")
     scale = known["SCAL"].numbers().ravel() if "SCAL" in known else np.ones(1)
     if len(scale) not in (1, values.shape[1]) or not scale.all():
         raise ValueError(f"SCAL has {len(scale)} values for {values.shape[1]} columns of {data.key}")

@@ -45,7 +45,7 @@ class Item:
         letters = kinds if self.kind == "?" else self.kind * (self.size // max(_width(self.kind), 1))
         known = letters and all(letter in _TYPES for letter in letters)
         row = np.dtype([(f"_{i}", _TYPES[letter]) for i, letter in enumerate(letters)]) if known else None
-        if row is None or row.itemsize != self.size:
+        if row is None or row.itemsize != self.size or not self.data:
             raise ValueError(f"{self.key} has values of type {self.kind!r} and {self.size} bytes")
         rows = np.frombuffer(self.data, dtype=row)
         return np.stack([rows[name].astype(np.float64) for name in row.names or ()], axis=-1)
