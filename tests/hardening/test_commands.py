@@ -27,7 +27,7 @@ export run --format kml --out run.kml
 ALL = f"""{FEW}
 simulate rendered-room-10s --seed 1 --out room
 match room --force
-degrade walk --gnss-white 3 --out worse
+degrade walk --seed 1 --gnss-white 3 --out worse
 replay walk --to 12 --out causal
 intervals walk --to 45 --every 10 --reference walk
 compare run causal --out both.rrd
