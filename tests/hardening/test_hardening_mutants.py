@@ -12,6 +12,7 @@ import mutants
 def check(count, seed):
     faults, counts = mutants.judged(count, seed, list(mutants.BASES))
     assert faults == []
+    assert [text for text in counts if text.startswith("silent: ")] == []  # read with other values, and nothing said
     assert counts["refused"] > count / 4 and counts["read"] > count / 20
     assert counts["refused, place named"] >= 0.95 * counts["refused, with a place to name"]
 
