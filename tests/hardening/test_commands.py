@@ -95,7 +95,7 @@ def traced(trace):
             fails = re.search(r"= -1 E", line)
             if not fails and (not call.startswith("open") or re.search(r"O_(WRONLY|RDWR|CREAT)", line)):
                 changed |= {os.path.join(at or "/", name) for at, name in NAMED.findall(line)}
-        elif not call.startswith(("+++", "---")) and "resumed>" not in line:
+        elif not call.startswith(("+++", "---", "socketpair")) and "resumed>" not in line:  # a pair: within the process
             network.append(line)
     return network, changed
 
