@@ -60,6 +60,13 @@ KINDS: dict[str, CalibrationKind] = {
         "smartnav calibrate camera pictures/ --board chessboard:9x6:0.025 --out calibration.toml --report camera.html",
         paths=True,
     ),
+    "stereo": CalibrationKind(
+        "stereo",
+        "StereoOptions",
+        "two cameras and their relative pose from pairs of pictures of a board",
+        "smartnav calibrate stereo left/ right/ --board chessboard:9x6:0.025 --out calibration.toml",
+        paths=True,
+    ),
     "camera-imu": CalibrationKind(
         "camera_imu",
         "CameraImuOptions",

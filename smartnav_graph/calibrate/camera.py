@@ -80,7 +80,7 @@ def fit(sources: Sequence[Path], options: CameraOptions) -> CalibrationResult:
         expected = "what the pictures show, as chessboard:9x6:0.025"
         raise ConfigError("--board", "is missing", expected, "see smartnav calibrate camera --help")
     board = Board.parse(options.board)
-    found = find_views(_files(sources, options.camera), board, options.corner_window)
+    found = find_views(picture_files(sources, options.camera), board, options.corner_window)
     fitted = calibrate_camera(found.views, found.size, options.model, keep=options.keep_views)
     if board.kind == "circles":
         views = without_eccentricity(fitted, found.views, board)
@@ -88,7 +88,7 @@ def fit(sources: Sequence[Path], options: CameraOptions) -> CalibrationResult:
     return _result(fitted, found, options)
 
 
-def _files(sources: Sequence[Path], camera: str) -> list[tuple[str, Path]]:
+def picture_files(sources: Sequence[Path], camera: str) -> list[tuple[str, Path]]:
     """Name and path of every picture."""
     found: list[tuple[str, Path]] = []
     for source in sources:
@@ -212,7 +212,7 @@ def _result(found: CameraFit, seen: Found, options: CameraOptions) -> Calibratio
     return CalibrationResult(
         values,
         residuals,
-        warnings=(*seen.warnings, *_left_out(left_out), *_warnings(found, sigma.values)),
+        warnings=(*seen.warnings, *left_out_lines(left_out), *_warnings(found, sigma.values)),
         change=_change(found, options.camera),
         charts=camera_charts(found, sigma),
         order=order,
@@ -220,7 +220,7 @@ def _result(found: CameraFit, seen: Found, options: CameraOptions) -> Calibratio
     )
 
 
-def _left_out(pictures: Sequence[tuple[str, str]]) -> list[str]:
+def left_out_lines(pictures: Sequence[tuple[str, str]]) -> list[str]:
     """One line for each reason."""
     by_reason: dict[str, list[str]] = {}
     for name, why in pictures:

@@ -15,7 +15,7 @@ Source: Zhang (2000), A flexible new technique for camera calibration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -123,9 +123,13 @@ class CameraFit:
     @property
     def camera(self) -> Camera:
         """As calibration.toml holds it."""
-        fx, fy, cx, cy, *distortion = map(float, self.theta)
-        model = "fisheye" if self.model == "fisheye" else "brown"
-        return Camera(self.width, self.height, fx, fy, cx, cy, model, tuple(distortion))
+        return interior_camera(self.model, (self.width, self.height), self.theta)
+
+
+def interior_camera(model: str, size: tuple[int, int], theta: Floats) -> Camera:
+    """The camera of one of `MODELS` with the parameters (p,)."""
+    fx, fy, cx, cy, *distortion = map(float, theta)
+    return Camera(*size, fx, fy, cx, cy, "fisheye" if model == "fisheye" else "brown", tuple(distortion))
 
 
 def project_board(model: str, theta: Floats, pose: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
@@ -154,12 +158,15 @@ def pose_of(found: CameraFit, view: BoardView) -> Floats:
 
 def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[BoardView]) -> Normal:
     """Residuals and normal matrix of theta."""
-    p = len(theta)
+    projected = (project_board(model, theta, pose, view.points) for view, pose in zip(views, poses, strict=True))
+    return normal_of(len(theta), ((view.xy - xy, A, B) for view, (xy, A, B) in zip(views, projected, strict=True)))
+
+
+def normal_of(p: int, views: Iterable[tuple[Floats, Floats, Floats]]) -> Normal:
+    """Of residuals (n, 2) of views, their derivatives by theta (2 n, p), and by the pose of each (2 n, 6)."""
     S, g = np.zeros((p, p)), np.zeros(p)
     residuals, reduced, kept = [], [], []
-    for view, pose in zip(views, poses, strict=True):
-        xy, A, B = project_board(model, theta, pose, view.points)
-        r = view.xy - xy
+    for r, A, B in views:
         BB, BA, Br = B.T @ B, B.T @ A, B.T @ r.ravel()
         A_v = A - B @ np.linalg.solve(BB, BA)
         S += A_v.T @ A_v
@@ -170,15 +177,15 @@ def linearise(model: str, theta: Floats, poses: Floats, views: Sequence[BoardVie
     return Normal(residuals, reduced, S, g, kept)
 
 
-def minimise_views(
-    model: str, theta: Floats, poses: Floats, views: Sequence[BoardView]
+def minimise(
+    linearised: Callable[[Floats, Floats], Normal], theta: Floats, poses: Floats
 ) -> tuple[Floats, Floats, Normal]:
     """Levenberg-Marquardt over theta and the poses; where it does not converge, S is nearly singular."""
-    now, damping = linearise(model, theta, poses, views), 1e-6
+    now, damping = linearised(theta, poses), 1e-6
     for _ in range(_ITERATIONS):
         step = np.linalg.solve(now.S + damping * np.diag(np.diag(now.S)), now.g)
         moves = [np.linalg.solve(BB, Br - BA @ step) for BB, BA, Br in now.poses]
-        tried = linearise(model, theta + step, poses + np.array(moves), views)
+        tried = linearised(theta + step, poses + np.array(moves))
         if tried.cost <= now.cost:
             small = now.cost - tried.cost <= _CONVERGED * now.cost
             theta, poses, now, damping = theta + step, poses + np.array(moves), tried, max(damping / 10, 1e-12)
@@ -192,7 +199,7 @@ def minimise_views(
 
 
 def _fit(model: str, size: tuple[int, int], views: Sequence[BoardView], theta: Floats, poses: Floats) -> CameraFit:
-    theta, poses, normal = minimise_views(model, theta, poses, views)
+    theta, poses, normal = minimise(lambda t, p: linearise(model, t, p, views), theta, poses)
     names = (*PINHOLE, *MODELS[model])
     scale = np.sqrt(np.diag(normal.S))
     values, axes = np.linalg.eigh(normal.S / np.outer(scale, scale))
@@ -301,7 +308,7 @@ def _fisheye_start(size: tuple[int, int], views: Sequence[BoardView]) -> tuple[F
         if poses is None:
             continue
         try:
-            found = minimise_views("fisheye", theta, poses, views)
+            found = minimise(lambda t, p: linearise("fisheye", t, p, views), theta, poses)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
         if np.isfinite(found[2].cost) and (best is None or found[2].cost < best[2].cost):
