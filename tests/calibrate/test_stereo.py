@@ -66,7 +66,7 @@ def test_pairs_that_do_not_belong_together():
     ]
     with pytest.raises(CalibrationError, match="3 pairs of 3 and 12 views"):
         paired(left[:3], right)
-    with pytest.raises(CalibrationError, match="12 pictures as l0.png with 11 numbers"):
+    with pytest.raises(CalibrationError, match=r"12 pictures as l0\.png with 11 numbers"):
         paired([*left[:-1], replace(left[0], name="again_0.png")], right)
     both, alone = paired(left[:5], right)
     assert len(both) == 5 and [name for name, _ in alone] == [f"r{i}.png" for i in range(5, 12)]
