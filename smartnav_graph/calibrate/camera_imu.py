@@ -1,7 +1,7 @@
-"""Camera against IMU: clock offset and its drift, the turn of the camera in the body, readout of a rolling shutter.
+"""Camera against IMU: clock offset and its drift, turn and position of the camera in the body, rolling shutter.
 
 From any recording with tracks or matches in which the device was turned about more than one axis; see `turns`. The
-lever arm acts on the images through the scale of the motion, which matches do not have; it is not estimated.
+position needs accelerations, too, which give the motion its length; see `lever_arm`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from smartnav_graph.calibrate.lever_arm import lever_arm
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
-from smartnav_graph.calibrate.turns import GyroAlignment, align_to_gyro
+from smartnav_graph.calibrate.turn_start import TurnProblem, TurnState
+from smartnav_graph.calibrate.turns import GyroAlignment, align_to_gyro, usable_pairs
+from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import CalibrationError, ConfigError, SmartnavError
 from smartnav_graph.core.so3 import log
 from smartnav_graph.session.calibration.camera import Camera
@@ -25,7 +28,9 @@ WHERE = "calibrate camera-imu"
 RATE_HZ = 10.0  # of the images of tracks
 LENGTH_S = (0.15, 1.2)  # of pairs of matches
 LEAST_RATE = 0.05  # rad/s, root mean square about the mean of the rates
-OPEN_DEG = 1.0  # sigma of a turn from which it is refused
+OPEN_DEG, OPEN_M = 1.0, 0.015  # sigmas of a turn and of a position from which they are refused
+ARM_LENGTH_S = (0.2, 0.5)  # of pairs of tracks for the position
+MOVING = "move it by 0.3 m and more while it turns, to all sides, for half a minute"
 LEAST_SIGMA_S, LEAST_SIGMA_DEG = 1e-4, 0.01  # in calibration.toml: images and inertial data have other errors
 TURNING = "turn the device by 30 deg and more about all of its axes, back and forth, for half a minute"
 MATCHING = "run smartnav match SESSION --features klt before"
@@ -60,11 +65,20 @@ def fit(sources: Sequence[Session], options: CameraImuOptions) -> CalibrationRes
     spread = float(np.sqrt((imu.gyro - imu.gyro.mean(axis=0)).var(axis=0).sum()))
     if spread < LEAST_RATE:
         raise CalibrationError(WHERE, f"rates of {spread:.3f} rad/s (RMS)", f"at least {LEAST_RATE}", TURNING)
+    pairs = _pairs(session, (options.span, 2 * options.span))
     try:
-        found = align_to_gyro(_pairs(session, options.span), imu, camera.noise, camera=camera)
+        found = align_to_gyro(pairs, imu, camera.noise, camera=camera)
     except SmartnavError as error:
         raise CalibrationError(WHERE, error.found, error.expected, f"{error.remedy}; {TURNING}") from error
-    return _result(session, name, camera, found)
+    return _result(session, name, camera, found, _position(session, camera, found))
+
+
+def _position(session: Session, camera: Camera, found: GyroAlignment) -> tuple[Floats, Floats] | None:
+    """Of the camera in the body (3,) m, with covariance."""
+    imu = session.require_imu()
+    problem = TurnProblem(usable_pairs(_pairs(session, ARM_LENGTH_S), imu), imu, camera)
+    state = TurnState(found.offset_s, found.drift, found.body_R_cam, found.gyro_bias, found.readout_s)
+    return lever_arm(problem, state, found.noise, session.gravity)
 
 
 def _camera(session: Session, asked: str) -> tuple[str, Camera]:
@@ -79,11 +93,11 @@ def _camera(session: Session, asked: str) -> tuple[str, Camera]:
     return name, cameras[name]
 
 
-def _pairs(session: Session, span_s: float) -> Pairs:
+def _pairs(session: Session, spans_s: tuple[float, float]) -> Pairs:
     if session.tracks is not None:
         stamps = np.unique(session.tracks.t_ns)
         rate = min(RATE_HZ, 1e9 / float(np.median(np.diff(stamps)))) if len(stamps) > 1 else RATE_HZ
-        return pairs_of_tracks(session.tracks, rate, tuple({max(1, round(n * span_s * rate)) for n in (1, 2)}))
+        return pairs_of_tracks(session.tracks, rate, tuple({max(1, round(span * rate)) for span in spans_s}))
     if session.matches is None:
         raise CalibrationError(session.path or WHERE, "no tracks and no matches", "one of them", MATCHING)
     pairs = pairs_of_matches(session.matches)
@@ -91,7 +105,9 @@ def _pairs(session: Session, span_s: float) -> Pairs:
     return pairs.of(rows.astype(np.intp))
 
 
-def _result(session: Session, name: str, camera: Camera, found: GyroAlignment) -> CalibrationResult:
+def _result(
+    session: Session, name: str, camera: Camera, found: GyroAlignment, position: tuple[Floats, Floats] | None
+) -> CalibrationResult:
     values = {
         f"{name}_time_offset": Value(found.offset_s, float(found.sigma("offset")[0]), "s"),
         f"{name}_time_offset_drift": Value(found.drift, float(found.sigma("drift")[0]), "s/s"),
@@ -100,9 +116,7 @@ def _result(session: Session, name: str, camera: Camera, found: GyroAlignment) -
     if "readout" in found.terms:
         middle = found.offset_s + found.readout_s / 2
         values[f"{name}_time_offset_middle_row"] = Value(middle, found.middle_sigma_s, "s")
-    refused = {
-        f"{name}_lever_arm": "matches show directions only: measure it, or leave it to the smoother with fixes",
-    }
+    refused = _record_position(name, position, values)
     turn = np.degrees(log(np.asarray(session.mount(name).body_R).T @ found.body_R_cam))
     whole = np.degrees(log(found.body_R_cam))
     for axis, angle, all_of_it, sigma in zip("xyz", turn, whole, np.degrees(found.sigma("boresight")), strict=True):
@@ -123,9 +137,21 @@ def _result(session: Session, name: str, camera: Camera, found: GyroAlignment) -
         {f"{name}_matches": noise},
         refused,
         _warnings(found),
-        _change(session, name, found),
+        _change(session, name, found, None if f"{name}_position" in refused else position),
         charts=(_chart(found),),
     )
+
+
+def _record_position(name: str, position: tuple[Floats, Floats] | None, values: dict[str, Value]) -> dict[str, str]:
+    """The position among the values; the refusal where it is open."""
+    if position is None:
+        return {f"{name}_position": f"the recording is too short, or its pairs too few; {MOVING}"}
+    place, sigmas = position[0], np.sqrt(np.diag(position[1]))
+    for axis, value, sigma in zip("xyz", place, sigmas, strict=True):
+        values[f"{name}_position_{axis}"] = Value(float(value), float(sigma), "m")
+    if sigmas.max() <= OPEN_M:
+        return {}
+    return {f"{name}_position": f"sigma of {sigmas.max():.2g} m: not used; {MOVING}, or measure it"}
 
 
 def _warnings(found: GyroAlignment) -> tuple[str, ...]:
@@ -141,8 +167,11 @@ def _warnings(found: GyroAlignment) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _change(session: Session, name: str, found: GyroAlignment) -> Callable[[Calibration], Calibration]:
-    """Puts clock, readout and axes into the camera, where their sigmas are small enough."""
+def _change(
+    session: Session, name: str, found: GyroAlignment, position: tuple[Floats, Floats] | None
+) -> Callable[[Calibration], Calibration]:
+    """Puts clock, readout and axes into the camera, where their sigmas are small enough; the position where the session
+    has no mount of it, which was measured better."""
 
     def change(calibration: Calibration) -> Calibration:
         known = {} if session.calibration is None else session.calibration.cameras
@@ -155,6 +184,8 @@ def _change(session: Session, name: str, found: GyroAlignment) -> Callable[[Cali
         if sigma <= OPEN_DEG:
             axes = tuple(found.body_R_cam.ravel().tolist())
             camera = replace(camera, body_R=axes, boresight_sigma_deg=max(sigma, LEAST_SIGMA_DEG))
+        if position is not None and name not in session.sensors:
+            camera = replace(camera, body_t=tuple(position[0].tolist()))
         return replace(calibration, cameras={**calibration.cameras, name: camera})
 
     return change

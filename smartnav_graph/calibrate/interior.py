@@ -177,7 +177,7 @@ def normal_of(p: int, views: Iterable[tuple[Floats, Floats, Floats]]) -> Normal:
     return Normal(residuals, reduced, S, g, kept)
 
 
-def minimise(
+def minimise_views(
     linearised: Callable[[Floats, Floats], Normal], theta: Floats, poses: Floats
 ) -> tuple[Floats, Floats, Normal]:
     """Levenberg-Marquardt over theta and the poses; where it does not converge, S is nearly singular."""
@@ -199,7 +199,7 @@ def minimise(
 
 
 def _fit(model: str, size: tuple[int, int], views: Sequence[BoardView], theta: Floats, poses: Floats) -> CameraFit:
-    theta, poses, normal = minimise(lambda t, p: linearise(model, t, p, views), theta, poses)
+    theta, poses, normal = minimise_views(lambda t, p: linearise(model, t, p, views), theta, poses)
     names = (*PINHOLE, *MODELS[model])
     scale = np.sqrt(np.diag(normal.S))
     values, axes = np.linalg.eigh(normal.S / np.outer(scale, scale))
@@ -308,7 +308,7 @@ def _fisheye_start(size: tuple[int, int], views: Sequence[BoardView]) -> tuple[F
         if poses is None:
             continue
         try:
-            found = minimise(lambda t, p: linearise("fisheye", t, p, views), theta, poses)
+            found = minimise_views(lambda t, p: linearise("fisheye", t, p, views), theta, poses)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
         if np.isfinite(found[2].cost) and (best is None or found[2].cost < best[2].cost):

@@ -26,7 +26,7 @@ from smartnav_graph.calibrate.interior import (
     Normal,
     calibrate_camera,
     interior_camera,
-    minimise,
+    minimise_views,
     normal_of,
     pose_of,
     project_board,
@@ -135,7 +135,7 @@ def calibrate_stereo(left: CameraFit, right: CameraFit, pairs: Sequence[Pair]) -
     middle = between[int(np.argmin([np.linalg.norm(between[:, :3] - b[:3], axis=1).sum() for b in between]))]
     theta, left_out = np.concatenate([left.theta, right.theta, middle]), list[tuple[str, str]]()
     while True:
-        theta, poses, normal = minimise(_linearised(left.model, right.model, ordered), theta, poses)
+        theta, poses, normal = minimise_views(_linearised(left.model, right.model, ordered), theta, poses)
         rms = np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in normal.residuals])
         worst, usual = int(np.argmax(rms)), float(np.median(rms))
         if rms[worst] <= OUTLIER * usual or len(ordered) <= LEAST_VIEWS:

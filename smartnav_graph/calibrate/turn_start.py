@@ -79,7 +79,7 @@ class TurnProblem:
         self.there = pairs.there
         self.blocks = time_blocks(self.t)
         self._kept: tuple[Floats, Attitudes] | None = None
-        self._t_imu = seconds_since(imu.t_ns, self.t0_ns)
+        self.t_imu = seconds_since(imu.t_ns, self.t0_ns)
         self.rows: tuple[Floats, ...] = ()
         if camera is not None:
             last = camera.height - 1.0
@@ -118,7 +118,7 @@ class TurnProblem:
         t, out = self.times(state), []
         for i, (x, row) in enumerate(zip(self.x, self.rows, strict=True)):
             at = t[:, i] + state.readout_s / 2
-            rate = np.stack([np.interp(at, self._t_imu, column) for column in self.imu.gyro.T], axis=1)
+            rate = np.stack([np.interp(at, self.t_imu, column) for column in self.imu.gyro.T], axis=1)
             rate = (rate - state.bias) @ state.body_R_cam
             turn = (state.readout_s * row[..., None] * rate[:, None, :]).reshape(-1, 3)
             ray = rotate(exp(turn), rays(x).reshape(-1, 3)).reshape(*x.shape[:2], 3)

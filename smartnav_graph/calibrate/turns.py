@@ -37,6 +37,7 @@ from smartnav_graph.core.so3 import across, log
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.streams import Imu
+from smartnav_graph.vision.elimination import eliminated
 from smartnav_graph.vision.epipolar import Sampson, rays, sampson
 from smartnav_graph.vision.gating import Geometry
 from smartnav_graph.vision.pairs import Pairs
@@ -123,7 +124,7 @@ def align_to_gyro(
     SessionError
         Too few pairs or rotations, or no lag that fits clearly better than the others.
     """
-    pairs = _usable(pairs, imu)
+    pairs = usable_pairs(pairs, imu)
     problem = TurnProblem(pairs, imu, camera)
     state, known = start_of_turns(problem, sigma)
     if known < KNOWN:
@@ -152,7 +153,7 @@ def align_to_gyro(
     )
 
 
-def _usable(pairs: Pairs, imu: Imu) -> Pairs:
+def usable_pairs(pairs: Pairs, imu: Imu) -> Pairs:
     """Pairs with enough matches inside the inertial data, at most `MOST_PAIRS` evenly."""
     t = pairs.t_ns[pairs.images]
     inside = (t[:, 0] - imu.t_ns[0] > SEARCH_S * NS / 10) & (imu.t_ns[-1] - t[:, 1] > SEARCH_S * NS / 10)
@@ -213,7 +214,8 @@ def _solve(
             spread += [CHANGE_SIGMA] * 3
         if "bias" in where:
             prior[where["bias"], where["bias"]] = np.eye(3) * (noise / BIAS_SIGMA) ** 2
-        information, scores = _by_block(problem, *_reduced(J, Jt, r, weight, noise / np.array(spread)))
+        own_prior = np.diag((noise / np.array(spread)) ** 2)
+        information, scores = _by_block(problem, *eliminated(J, -Jt, -r, weight, own_prior))
         if "bias" in where:
             information, scores = _free_bias(information, scores, where["bias"], noise)
         g = scores.sum(axis=0)
@@ -264,18 +266,6 @@ def _derivatives(
             w = log(np.swapaxes(R, 1, 2) @ turned) / step[axis]
             columns.append(-np.einsum("nkj,nj->nk", seen.by_rotation, w))
     return np.stack(columns, axis=-1)
-
-
-def _reduced(J: Floats, Jt: Floats, r: Floats, weight: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """Information (n, p, p) and scores (n, p) of each pair; its own unknowns, of derivatives (n, k, q) and inverse
-    prior sigmas (q,), are eliminated."""
-    A = np.einsum("nkp,nk,nkq->npq", J, weight, J)
-    B = np.einsum("nkp,nk,nka->npa", J, weight, -Jt)
-    C = np.einsum("nka,nk,nkb->nab", Jt, weight, Jt) + np.diag(prior**2)
-    g = np.einsum("nkp,nk,nk->np", J, weight, r)
-    gt = np.einsum("nka,nk,nk->na", -Jt, weight, r)
-    CB = np.linalg.solve(C, np.swapaxes(B, 1, 2))
-    return A - B @ CB, g - np.einsum("nap,na->np", CB, gt)
 
 
 def _by_block(problem: TurnProblem, information: Floats, scores: Floats) -> tuple[Floats, Floats]:

@@ -314,10 +314,13 @@ class Session(Summarised, Streams):
         return float(np.degrees(np.arctan2(*self.magnetic_field_ut[:2])))
 
     def mount(self, sensor: str) -> Mount:
-        """Where `sensor` is mounted; the body origin where the session does not give it. Axes of a camera that were
-        calibrated take precedence."""
+        """Where `sensor` is mounted; the body origin where the session does not give it. What was calibrated of a
+        camera takes precedence."""
         found = self.sensors.get(sensor, _AT_ORIGIN)
         camera = None if self.calibration is None else self.calibration.cameras.get(sensor)
+        if camera is not None and camera.body_t:
+            x, y, z = camera.body_t
+            found = dataclasses.replace(found, body_t=(x, y, z))
         if camera is None or not camera.body_R:
             return found
         a, b, c, d, e, f, g, h, i = camera.body_R

@@ -32,7 +32,8 @@ class Camera:
     noise_px : sigma of an inlier match, px per axis; time_offset_s : a frame stamped t shows IMU time t + offset;
     readout_s : from the first row to the last, 0 for a global shutter
     boresight_sigma_deg, time_offset_sigma_s : sigmas of its attitude in the body and of its clock
-    body_R : row-major (3, 3), its axes in the body where they were calibrated; else the session's mount has them
+    body_R : row-major (3, 3), its axes, body_t : (3,) m, its place in the body where they were calibrated; else the
+    session's mount has them
     """
 
     width: int
@@ -49,6 +50,7 @@ class Camera:
     boresight_sigma_deg: float = 0.5
     time_offset_sigma_s: float = 0.02
     body_R: tuple[float, ...] = ()
+    body_t: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, self.time_offset_s, self.readout_s)
@@ -69,6 +71,9 @@ class Camera:
                 raise self._error(f"{name} = {getattr(self, name)}", "a finite number >= 0")
         if self.body_R and not (len(self.body_R) == 9 and is_rotation(np.reshape(self.body_R, (3, 3)))):
             raise self._error(f"body_R = {list(self.body_R)}", "nine numbers of a rotation matrix, row by row")
+
+        if self.body_t and not (len(self.body_t) == 3 and all(map(math.isfinite, self.body_t))):
+            raise self._error(f"body_t = {list(self.body_t)}", "three finite numbers", "give m")
 
     def _error(self, found: str, expected: str, remedy: str = "see calibration/camera.py") -> CalibrationError:
         return CalibrationError("calibration.toml [cameras]", found, expected, remedy)
