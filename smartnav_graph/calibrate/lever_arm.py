@@ -53,7 +53,7 @@ class Baselines(NamedTuple):
         return t
 
 
-class Step(NamedTuple):
+class Correction(NamedTuple):
     """Of [b, l, e] (9,) and [v, g] (w, 6); information (w, 9, 9) and scores (w, 9) of [b, l, e] by window."""
 
     common: Floats
@@ -154,7 +154,7 @@ def _integrals(problem: TurnProblem, state: TurnState, at: Floats) -> tuple[Floa
 
 def _solved(
     linear: Baselines, information: Floats, scores: Floats, common: Floats, own: Floats, gravity: float
-) -> Step:
+) -> Correction:
     """Gauss-Newton step by information (n, 15, 15) and scores (n, 15) of the pairs."""
     reduced, right, parts = [], [], []
     for rows, x in zip(linear.windows, own, strict=True):
@@ -171,4 +171,4 @@ def _solved(
         parts.append((inner, inner_g, cross))
     step = np.linalg.solve(sum(reduced) + PRIOR, sum(right) - PRIOR @ common)
     more = np.array([np.linalg.solve(inner, g - cross @ step) for inner, g, cross in parts])
-    return Step(step, more, np.array(reduced), np.array(right))
+    return Correction(step, more, np.array(reduced), np.array(right))
