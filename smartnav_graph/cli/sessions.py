@@ -218,12 +218,12 @@ class View(Command):
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SESSION|RUN")]
     """Session folders, run folders, .rrd files."""
     web: Switch = False
-    """Use a browser instead of a window."""
+    """Serve to a browser of this machine, and print the link."""
 
     def run(self) -> None:
         from smartnav_graph.output.rerun_log import view
 
-        view(self.paths, self.web)
+        view(self.paths, self.web, announce=lambda address: print(f"open in a browser: {address}", flush=True))
 
 
 def assigned_seconds(texts: Sequence[str]) -> dict[str, float]:

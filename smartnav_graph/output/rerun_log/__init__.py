@@ -173,6 +173,7 @@ def _log_all(recorder: Recorder, shown: _Shown) -> rrb.Blueprint:
     if shown.updates is not None:
         replays.log_updates(recorder, shown.updates)
     timeline.log_status(recorder, session, found)
+    timeline.log_verdict(recorder, session, shown.summary, found)
     timeline.log_lines(recorder, session, found, shown.summary, notes)
     timeline.log_report(recorder, shown.report_markdown)
     return blueprint.build(recorder, session, solution, extent, factor, views)

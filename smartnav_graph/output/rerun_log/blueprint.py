@@ -31,14 +31,14 @@ _MOTION: Names = (
     ("Height m", "/motion/height"),
 )
 _ACCURACY: Names = (
-    ("Position error m, bands 1σ 3σ", "/error/position"),
+    ("Position error m", "/error/position"),
     ("Rotation error °", "/error/rotation"),
     ("Position σ m", "/sigma/position"),
     ("Heading σ °", "/sigma/heading"),
 )
 _BIASES: Names = (
-    ("Accelerometer bias m/s², bands 1σ 3σ", "/bias/accel"),
-    ("Gyroscope bias rad/s, bands 1σ 3σ", "/bias/gyro"),
+    ("Accelerometer bias m/s²", "/bias/accel"),
+    ("Gyroscope bias rad/s", "/bias/gyro"),
 )
 _UPDATES: Names = (
     ("Updates: states (latency ms in latency.rrd)", "/update/effort"),
@@ -223,7 +223,9 @@ def _right(recorder: Recorder, session: Session, solution: Solution | None, kind
     def series(names: Names, first: str = "") -> list[View]:
         there = [(name, path) for name, path in names if recorder.has(path)]
         there.sort(key=lambda item: item[1] != first)
-        return [series_view(name, _contents(path), limits=recorder.limits.get(path)) for name, path in there]
+        return [
+            view for name, path in there for view in (banded(recorder, name, path) or [_series(recorder, name, path)])
+        ]
 
     raw = series(tuple((signal.title, signal.path) for signal in signals.signals_of(session)))
     # Without a solution every signal is shown at once.
@@ -233,7 +235,9 @@ def _right(recorder: Recorder, session: Session, solution: Solution | None, kind
     )
     log = rrb.TextLogView(name="Log", origin="/log", columns=log_columns()) if recorder.has("/log") else None
     count = 2.0 if solution is not None else 2.0 * max(1, len(raw))
+    verdict = rrb.TextDocumentView(name="Verdict", origin="/verdict") if recorder.has("/verdict") else None
     parts = [
+        verdict,
         shown,
         _tabs(series(_ACCURACY)),
         _tabs(series(_BIASES) + series(_clocks(recorder))),
@@ -242,17 +246,37 @@ def _right(recorder: Recorder, session: Session, solution: Solution | None, kind
         log,
     ]
     statuses = sum(path.startswith("/status/") for path in recorder.paths)
-    return _stack(parts, [count, 2.0, 2.0, 2.0, 0.8 + 0.5 * statuses, 1.8])
+    return _stack(parts, [1.1, count, 2.0, 2.0, 2.0, 0.8 + 0.5 * statuses, 1.8])
 
 
-def _contents(path: str) -> list[str]:
-    # with the latency of the updates, where the second recording is open
-    return [f"{path}/**", "/update/latency"] if path == "/update/effort" else [f"{path}/**"]
+def _series(recorder: Recorder, name: str, path: str) -> View:
+    # with the latency of the updates, where the second recording is open; with what the wheels measured
+    beside = {"/update/effort": ["/update/latency"], "/motion/speed": ["/wheel"]}.get(path, [])
+    return series_view(name, [f"{path}/**", *beside], limits=recorder.limits.get(path))
+
+
+def banded(recorder: Recorder, name: str, path: str) -> list[View]:
+    """Views of lines with bands: all axes with one sigma, then each axis with one and three; empty where `path` has no
+    bands."""
+    bands = "bands 1σ 3σ"
+    if f"{path}/three_sigma" in recorder.paths:
+        return [series_view(f"{name}, {bands}", [f"{path}/**"], limits=recorder.limits.get(path))]
+    axes = [axis for axis in signals.AXES if f"{path}/{axis}/three_sigma" in recorder.paths]
+    if not axes:
+        return []
+    whole = series_view(f"{name}, bands 1σ", [f"{path}/{axis}" for axis in axes], limits=recorder.limits.get(path))
+    what, _, unit = name.rpartition(" ")
+    return [whole] + [
+        series_view(
+            f"{what} {axis} {unit}, {bands}", [at := f"{path}/{axis}", f"{at}/**"], limits=recorder.limits.get(at)
+        )
+        for axis in axes
+    ]
 
 
 def _clocks(recorder: Recorder) -> Names:
     sensors = sorted({path.split("/")[2] for path in recorder.paths if path.startswith("/clock/")})
-    return tuple((f"Clock offset of {sensor} s, bands 1σ 3σ", f"/clock/{sensor}") for sensor in sensors)
+    return tuple((f"Clock offset of {sensor} s", f"/clock/{sensor}") for sensor in sensors)
 
 
 def _residuals(recorder: Recorder, solution: Solution | None) -> list[View]:

@@ -148,10 +148,7 @@ def _blueprint(
     scene = blueprint.world_view(title, extent, np.array([0.2, 0.35, -0.9]), [0.0, 0.0, 1.0])
     log = rrb.TextLogView(name="Largest differences: click a time", origin="/log", columns=blueprint.log_columns())
     table = [rrb.TextDocumentView(name="Figures", origin="/report")] if recorder.has("/report") else []
-    plots = [
-        blueprint.series_view(f"{name}, bands 1σ 3σ", [f"{path}/**"], limits=recorder.limits.get(path))
-        for path, name, *_ in PLOTS
-    ]
+    plots = [rrb.Tabs(*blueprint.banded(recorder, name, path), active_tab=0) for path, name, *_ in PLOTS]
     sigmas = blueprint.series_view("Horizontal position σ m", ["/sigma/**"])
     at = int(comparison.magnitude(MEASURES[0]).argmax())
     around = comparison.t_ns[[max(at - AROUND, 0), min(at + AROUND, len(comparison) - 1)]] - comparison.t0_ns

@@ -20,6 +20,7 @@ from smartnav_graph.session.session import Session
 # Units of columns by the ends of their names.
 UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_ut": "µT", "_hpa": "hPa", "_c": "°C"}
 MARKER_SIZE = 2.0
+AXES = ("x", "y", "z", "east", "north", "up")
 MANY = 500
 EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
 
@@ -73,19 +74,25 @@ def log_bands(
     unit: str,
     colors: list[list[int]] | None = None,
 ) -> None:
-    """Lines with bands of one sigma, and at `path`/three_sigma of three: values and sigmas (n, k)."""
+    """Lines with bands of one sigma, values and sigmas (n, k), at `path`/<name> (at `path` itself where k is 1), and
+    below it at ``three_sigma`` with bands of three."""
     colors = colors or colours.of_axes(len(names))
-    for where, times in ((path, 1.0), (f"{path}/three_sigma", 3.0)):
-        columns = rr.Measurements.columns(values=values, variances=(times * sigmas) ** 2)
-        recorder.rows(where, t_ns, columns)
-        style = rr.Measurements.from_fields(
-            names=names,
-            units=[unit] * len(names),
-            colors=colors,
-            widths=[1.5 if times == 1.0 else 0.0] * len(names),
-        )
-        recorder.style(where, style)
+    for k, name in enumerate(names):
+        here = axis_path(path, name, len(names))
+        value, sigma = values[:, k : k + 1], sigmas[:, k : k + 1]
+        for where, times in ((here, 1.0), (f"{here}/three_sigma", 3.0)):
+            recorder.rows(where, t_ns, rr.Measurements.columns(values=value, variances=(times * sigma) ** 2))
+            width = 1.5 if times == 1.0 else 0.0
+            style = rr.Measurements.from_fields(names=[name], units=[unit], colors=[colors[k]], widths=[width])
+            recorder.style(where, style)
+        if len(names) > 1:
+            recorder.widen(here, value - 3.0 * sigma, value + 3.0 * sigma)
     recorder.widen(path, values - 3.0 * sigmas, values + 3.0 * sigmas)
+
+
+def axis_path(path: str, name: str, count: int) -> str:
+    """Entity of one of `count` lines with bands."""
+    return f"{path}/{name}" if count > 1 else path
 
 
 def log_biases(recorder: Recorder, solution: Solution, evaluation: Evaluation | None) -> None:

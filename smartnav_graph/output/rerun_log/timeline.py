@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import rerun as rr
 
-from smartnav_graph.core.timebase import Gap, seconds_since
+from smartnav_graph.core.timebase import NS, Gap, seconds_since
 from smartnav_graph.output.rerun_log.events import REJECTED, WITHHELD, Events, switches
 from smartnav_graph.output.rerun_log.recorder import Recorder
-from smartnav_graph.output.summary_json import Summary, other_warnings, table_of, text_of, verdict_lines
+from smartnav_graph.output.summary_json import (
+    Summary,
+    as_float,
+    other_warnings,
+    rows_of,
+    table_of,
+    text_of,
+    verdict_lines,
+)
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
@@ -31,8 +41,8 @@ _LEGEND = {
     "/world/rejected": "**red points**, rejected positions of other kinds",
     "/world/pose_fixes": "**cyan points**, pose fixes",
     "/world/control": "**pink points**, control points",
-    "/error/position": "**bands**, one and three sigma of the run. If the run was aligned to the reference, errors are "
-    "not zero at the start, but sigmas may be",
+    "/error/position": "**bands**, one sigma of the run, and three in the views of one axis. If the run was aligned to "
+    "the reference, errors are not zero at the start, but sigmas may be",
 }
 
 _IMAGE_LEGEND = {
@@ -127,6 +137,32 @@ def _capped(lines: list[Line]) -> list[Line]:
 def _of_images(path: str) -> str:
     """The meaning of what is drawn in an image; empty for anything else."""
     return next((text for end, text in _IMAGE_LEGEND.items() if path.endswith(end) and path != "/pairs/matches"), "")
+
+
+def log_verdict(recorder: Recorder, session: Session, summary: Summary, events: Events) -> None:
+    """The verdict at /verdict, and where its reasons have a time, what it is there at /status/verdict."""
+    lines = verdict_lines(summary)
+    if not lines:
+        return
+    level, *reasons = lines
+    text = "\n".join([f"**{level.capitalize()}**", "", *(f"- {reason}" for reason in reasons)])
+    recorder.static("/verdict", rr.TextDocument(text, media_type="text/markdown"))
+    found, spans = table_of(summary, "verdict"), list[Gap]()
+    for reason in rows_of(found, "reasons"):
+        start, end = as_float(reason.get("start_s")), as_float(reason.get("end_s"))
+        if start is not None and end is not None:
+            first, last = (session.t0_ns + round(t * NS) for t in (start, end))
+            spans.append(Gap(max(first, events.start_ns), min(last, events.end_ns), text_of(reason, "sensor")))
+    spans = _apart([span for span in spans if span.end_ns > span.start_ns])
+    if spans:
+        _log_state(recorder, "/status/verdict", events, spans, "no objection")
+
+
+def _apart(spans: list[Gap]) -> list[Gap]:
+    """Spans in time order, each ended where the next begins."""
+    spans = sorted(spans, key=lambda span: span.start_ns)
+    cut = [Gap(one.start_ns, min(one.end_ns, after.start_ns), one.kind) for one, after in pairwise(spans)]
+    return [span for span in [*cut, *spans[-1:]] if span.end_ns > span.start_ns]
 
 
 def log_report(recorder: Recorder, markdown: str | None) -> None:

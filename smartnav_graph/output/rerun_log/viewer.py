@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from pathlib import Path
+from urllib.parse import quote
 
 from smartnav_graph.core.errors import SessionError, SmartnavError
 from smartnav_graph.session.folder import load
@@ -40,13 +43,14 @@ def _recordings(path: Path, new: Path) -> list[Path]:
     raise SessionError(path, found, "a .rrd file, a run folder or a session folder", "check the path")
 
 
-def view(paths: Iterable[str | Path], web: bool = False) -> None:
+def view(paths: Iterable[str | Path], web: bool = False, *, announce: Callable[[str], None] | None = None) -> None:
     """Show recordings, runs and sessions in the Rerun viewer; returns when the viewer is closed.
 
     Parameters
     ----------
     paths : .rrd files, run folders, session folders; several open together
     web : serve the viewer to a browser instead of opening a window
+    announce : called with the address to open in a browser
 
     Raises
     ------
@@ -60,11 +64,31 @@ def view(paths: Iterable[str | Path], web: bool = False) -> None:
     with tempfile.TemporaryDirectory(prefix="smartnav-view-") as scratch:
         files = recordings(paths, Path(scratch))
         # Only this machine may connect: the viewer listens to the whole network otherwise.
-        options = ["--bind", "127.0.0.1", *(["--web-viewer"] if web else [])]
+        options = ["--bind", "127.0.0.1"]
+        if web:
+            page, data = free_ports(2)
+            options += ["--serve-web", "--web-viewer-port", str(page), "--port", str(data)]
+            proxy = quote(f"rerun+http://127.0.0.1:{data}/proxy", safe="")
+            (announce or _ignore)(f"http://127.0.0.1:{page}/?url={proxy}")
         command = [str(executable()), *options, *(str(file.resolve()) for file in files)]
-        code = subprocess.run(command, check=False).returncode
+        # the viewer's own messages name other addresses
+        environment = {**os.environ, "RUST_LOG": "error"} if web else None
+        code = subprocess.run(command, check=False, env=environment).returncode
     if code not in (0, -2, 130):  # closed, or interrupted by the user
         raise SmartnavError("Rerun viewer", f"ended with code {code}", "0", "read its messages above, or try --web")
+
+
+def _ignore(address: str) -> None:
+    pass
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of this machine that nothing listens to."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in sockets]
 
 
 def _require_display() -> None:

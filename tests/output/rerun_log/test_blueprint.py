@@ -12,7 +12,9 @@ from smartnav_graph.output.rerun_log import blueprint, recorder, spatial
 def test_every_view_has_data_and_every_kind_of_data_a_view(recording):
     names = recording.view_names()
     assert {"Report", "Map", "IMU accel m/s²", "IMU gyro rad/s", "States", "Log", "Residuals GNSS (σ)"} <= set(names)
-    assert {"Position error m, bands 1σ 3σ", "Accelerometer bias m/s², bands 1σ 3σ", "Rotation error °"} <= set(names)
+    assert {"Position error m, bands 1σ", "Accelerometer bias m/s², bands 1σ", "Rotation error °"} <= set(names)
+    each = {f"Position error {axis} m, bands 1σ 3σ" for axis in ("east", "north", "up")}
+    assert each | {f"Gyroscope bias {axis} rad/s, bands 1σ 3σ" for axis in "xyz"} <= set(names)
     assert {"Speed m/s", "Heading, pitch, roll °", "Height m", "Behind the body"} <= set(names)
     absent = ("Camera", "Points", "Magnetometer", "Updates", "Matches", "Factor graph", "States of the session")
     assert not [name for name in names if name.startswith(absent)]

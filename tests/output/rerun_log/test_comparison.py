@@ -30,10 +30,11 @@ def recording(runs, tmp_path_factory):
 
 def test_differences_row_by_row_with_the_larger_sigma(runs, recording):
     first, second = runs
-    values = recording.values("/difference/position", "Measurements:values")
-    np.testing.assert_allclose(values, second.nav_t_body - first.nav_t_body, atol=1e-6)
-    variances = recording.values("/difference/position", "Measurements:variances")
-    np.testing.assert_allclose(variances, second.sigmas[:, 3:6] ** 2, rtol=1e-6)
+    for k, axis in enumerate(("east", "north", "up")):
+        values = recording.values(f"/difference/position/{axis}", "Measurements:values").ravel()
+        np.testing.assert_allclose(values, (second.nav_t_body - first.nav_t_body)[:, k], atol=1e-6)
+        variances = recording.values(f"/difference/position/{axis}", "Measurements:variances").ravel()
+        np.testing.assert_allclose(variances, second.sigmas[:, 3 + k] ** 2, rtol=1e-6)
 
 
 def test_both_paths_and_what_each_plot_needs(runs, recording):
@@ -41,12 +42,15 @@ def test_both_paths_and_what_each_plot_needs(runs, recording):
         points = recording.values(f"/world/{name}/now", "Points3D:positions")[:, 0]
         np.testing.assert_allclose(points, solution.nav_t_body, rtol=1e-6, atol=1e-4)
         assert recording.rows(f"/world/{name}/path", "LineStrips3D:strips", static=True)
-    assert {path for path, *_ in PLOTS} <= recording.paths
+    there = {
+        path for path, *_, lines in PLOTS for path in ([path] if len(lines) == 1 else [f"{path}/{x}" for x in lines])
+    }
+    assert there <= recording.paths
 
 
 def test_time_lines_of_every_row(runs, recording):
     for timeline in ("elapsed", "utc"):
-        stamps = recording.index("/difference/position", "Measurements:values", timeline)
+        stamps = recording.index("/difference/position/up", "Measurements:values", timeline)
         assert stamps[7] - stamps[0] == runs[0].t_ns[7] - runs[0].t_ns[0], timeline
 
 
@@ -69,4 +73,4 @@ def test_views_name_the_runs(recording):
 def test_equal_runs_have_no_difference_to_magnify(runs, tmp_path):
     first, _ = runs
     write_comparison(tmp_path / "same.rrd", first, first, compare(first, first))
-    assert "/difference/position" in Recording(tmp_path / "same.rrd").paths
+    assert "/difference/position/east" in Recording(tmp_path / "same.rrd").paths

@@ -16,17 +16,17 @@ from smartnav_graph.output.rerun_log import signals
 
 def test_biases_and_errors_carry_their_variances(recording):
     solution = make_solution()
-    np.testing.assert_array_equal(recording.values("/bias/accel", "Measurements:values"), solution.accel_bias)
-    variances = recording.values("/bias/gyro", "Measurements:variances")
-    np.testing.assert_allclose(variances, solution.sigmas[:, 12:15] ** 2, rtol=1e-12)
-    np.testing.assert_array_equal(recording.values("/error/position", "Measurements:values"), EVALUATION.error_enu_m)
-    variances = recording.values("/error/position", "Measurements:variances")
-    np.testing.assert_allclose(variances, EVALUATION.sigma_enu**2, rtol=1e-12)
-    for path, sigma in (("/bias/accel", solution.sigmas[:, 9:12]), ("/error/position", EVALUATION.sigma_enu)):
-        wide = recording.values(f"{path}/three_sigma", "Measurements:variances")
-        np.testing.assert_allclose(np.sqrt(wide), 3 * sigma, rtol=1e-12)
-        same = recording.values(f"{path}/three_sigma", "Measurements:values")
-        np.testing.assert_array_equal(same, recording.values(path, "Measurements:values"))
+    enu, xyz = ("east", "north", "up"), ("x", "y", "z")
+    for path, names, values, sigma in (
+        ("/bias/accel", xyz, solution.accel_bias, solution.sigmas[:, 9:12]),
+        ("/bias/gyro", xyz, solution.gyro_bias, solution.sigmas[:, 12:15]),
+        ("/error/position", enu, EVALUATION.error_enu_m, EVALUATION.sigma_enu),
+    ):
+        for k, name in enumerate(names):
+            for where, times in ((f"{path}/{name}", 1), (f"{path}/{name}/three_sigma", 3)):
+                np.testing.assert_array_equal(recording.values(where, "Measurements:values").ravel(), values[:, k])
+                variances = recording.values(where, "Measurements:variances").ravel()
+                np.testing.assert_allclose(np.sqrt(variances), times * sigma[:, k], rtol=1e-12)
     np.testing.assert_array_equal(recording.values("/sigma/position", "Scalars:scalars"), solution.sigmas[:, POS])
 
 

@@ -24,7 +24,7 @@ from smartnav_graph.session.streams import ControlPoint
 def test_legend_names_what_is_drawn_and_nothing_else(recording):
     legend = recording.rows("/legend", "TextDocument:text", static=True)[0][0]
     named = {line.split("]")[0][3:] for line in legend.splitlines() if line.startswith("* [")}
-    assert named < recording.paths
+    assert named - {"/error/position"} < recording.paths  # its axes are below it
     drawn = {path for path in recording.paths if path.startswith("/world/")} - {"/world/gnss/current"}
     assert named == drawn | {"/error/position"}  # bands that an alignment may leave
 
@@ -95,3 +95,25 @@ def test_rejected_points_of_other_kinds_are_marked_too(tmp_path):
     drawn = found.values("/world/rejected", "Points3D:positions", static=True)[0]
     np.testing.assert_array_equal(drawn, control.enu[1:2].astype(np.float32))
     assert "control: fix rejected at 15.00 s" in found.texts("/log", "TextLog:text")
+
+
+def test_the_verdict_is_shown_and_drawn_where_its_reasons_are(tmp_path):
+    reason = {
+        "level": "doubtful",
+        "sensor": "gnss",
+        "start_s": 10.0,
+        "end_s": 20.0,
+        "text": "fixes drift",
+        "remedy": "",
+    }
+    verdict = {
+        "level": "doubtful",
+        "reasons": [reason, {"level": "doubtful", "sensor": "imu", "text": "without a time", "remedy": ""}],
+    }
+    found = write(tmp_path / "d.rrd", summary={"verdict": verdict})
+    (text,) = found.rows("/verdict", "TextDocument:text", static=True)[0]
+    assert text.startswith("**Verdict: doubtful**") and "fixes drift" in text and "without a time" in text
+    assert found.texts("/status/verdict", "StateChange:state") == ["no objection", "gnss", "no objection"]
+    assert "Verdict" in found.view_names()
+    good = write(tmp_path / "g.rrd", summary={"verdict": {"level": "good", "reasons": []}})
+    assert "/verdict" in good.paths and "/status/verdict" not in good.paths

@@ -20,7 +20,7 @@ def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):
     (tmp_path / "run" / "run.rrd").write_bytes(b"")
     opened = []
 
-    def run(command, check):
+    def run(command, check, env):
         opened.append(command)
         assert all(viewer.Path(file).is_file() for file in command[1:] if file.endswith(".rrd"))
         return SimpleNamespace(returncode=0)
@@ -29,8 +29,11 @@ def test_view_opens_recordings_runs_and_sessions(tmp_path, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     viewer.view([tmp_path / "session", tmp_path / "run"])
     assert [file.rsplit("/", 1)[-1] for file in opened[0][1:]] == ["--bind", "127.0.0.1", "0.rrd", "run.rrd"]
-    viewer.view([tmp_path / "run"], web=True)
-    assert "--web-viewer" in opened[1]
+    links = []
+    viewer.view([tmp_path / "run"], web=True, announce=links.append)
+    ports = [opened[1][opened[1].index(option) + 1] for option in ("--web-viewer-port", "--port")]
+    assert "--serve-web" in opened[1] and len({*ports}) == 2
+    assert links == [f"http://127.0.0.1:{ports[0]}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{ports[1]}%2Fproxy"]
     (tmp_path / "run" / "latency.rrd").write_bytes(b"")  # of a replay
     viewer.view([tmp_path / "run"], web=True)
     assert [file.rsplit("/", 1)[-1] for file in opened[2][-2:]] == ["run.rrd", "latency.rrd"]
