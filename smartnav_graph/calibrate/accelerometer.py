@@ -34,6 +34,7 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of M, in the order o
 MODELS = (3, 6, 9)
 GAIN = 0.9  # of the cross-validated RMS of the smaller model, which a larger one must reach
 APART = np.radians(15.0)  # between attitudes that count as two
+MANY, SHORT_S = 2 * MODELS[-1], 0.25  # rests, two a parameter; s
 LEAST_NOISE = 2e-4  # m/s^2, of the mean of a rest
 FAR = 0.25  # share of gravity by which the median reading may differ from it
 
@@ -47,7 +48,7 @@ class AccelerometerOptions:
     parameters: int | None = None
     """3, 6 or 9, instead of what cross-validation chooses."""
     least_rest_s: float = 0.75
-    """Shortest rest that is used, s."""
+    """Shortest rest that is used, s; where there are fewer than 18 of them, those of a quarter second are used, too."""
 
     def __post_init__(self) -> None:
         if self.parameters not in (None, *MODELS):
@@ -93,9 +94,15 @@ def fit(sources: Sequence[Session], options: AccelerometerOptions) -> Calibratio
     """Calibrate the accelerometer by the rests of one recording."""
     session = one_session(sources)
     warnings = check_readings(session, ("accel",))
-    rests = find_rests(session.require_imu(), options.least_rest_s)
-    fitted = fit_rests(session, rests, options.parameters)
+    fitted = fit_rests(session, rests_of(session, options.least_rest_s), options.parameters)
     return result_of(fitted, session.gravity, warnings)
+
+
+def rests_of(session: Session, least_s: float) -> list[RestRows]:
+    """Rests of at least `least_s`; where these are fewer than `MANY`, also those of `SHORT_S`."""
+    imu = session.require_imu()
+    rests = find_rests(imu, least_s)
+    return rests if len(rests) >= MANY else find_rests(imu, min(least_s, SHORT_S))
 
 
 def fit_rests(session: Session, rests: list[RestRows], parameters: int | None = None) -> AccelerometerFit:

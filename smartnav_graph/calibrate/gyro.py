@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from smartnav_graph.calibrate.accelerometer import AccelerometerFit, fit_rests, result_of
+from smartnav_graph.calibrate.accelerometer import AccelerometerFit, fit_rests, rests_of, result_of
 from smartnav_graph.calibrate.least_squares import Adjusted, adjust, derivatives_of
 from smartnav_graph.calibrate.rests import RestRows, check_readings, find_rests
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
@@ -179,7 +179,7 @@ def fit_both(session: Session, options: GyroOptions) -> tuple[CalibrationResult,
         fast = f"rates of {np.quantile(rates, 0.99):.3g} rad/s: they look like deg/s"
         raise CalibrationError(str(session.path or "session"), fast, "rad/s", "--repair units converts them")
     rests = find_rests(session.require_imu(), options.least_rest_s)
-    accel = fit_rests(session, rests)
+    accel = fit_rests(session, rests_of(session, options.least_rest_s))
     turns = turns_between(session, rests, accel, options)
     found, before = fit_turns(turns, str(session.path or "session"), options)
     by = accelerated_by(session, rests, accel, options, found.parameters.reshape(3, 3))
