@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smartnav_graph.calibrate.least_squares import Adjusted, adjust
-from smartnav_graph.calibrate.rests import RestRows, check_readings, find_rests
+from smartnav_graph.calibrate.rests import RestRows, check_readings, check_unit, find_rests
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
 from smartnav_graph.calibrate.static import one_session
 from smartnav_graph.core.arrays import Floats
@@ -36,7 +36,6 @@ GAIN = 0.9  # of the cross-validated RMS of the smaller model, which a larger on
 APART = np.radians(15.0)  # between attitudes that count as two
 MANY, SHORT_S = 2 * MODELS[-1], 0.25  # rests, two a parameter; s
 LEAST_NOISE = 2e-4  # m/s^2, of the mean of a rest
-FAR = 0.25  # share of gravity by which the median reading may differ from it
 
 
 @dataclass(frozen=True)
@@ -122,10 +121,7 @@ def fit_rests(session: Session, rests: list[RestRows], parameters: int | None = 
         raise CalibrationError(
             where, found, f"more than {MODELS[0]} attitudes {np.degrees(APART):.0f} deg apart", remedy
         )
-    length = float(np.median(np.linalg.norm(means, axis=1)))
-    if abs(length / session.gravity - 1) > FAR:
-        remedy = "import it in m/s^2 (--columns, --repair units)"
-        raise CalibrationError(where, f"specific force at rest is {length:.4g}", f"{session.gravity:.4g} m/s^2", remedy)
+    check_unit(session, means)
     sizes = [size for size in MODELS if size <= apart] if parameters is None else [parameters]
     if sizes[-1] > apart:
         raise CalibrationError(where, f"{apart} attitudes", f"at least {parameters}", "record more rests")

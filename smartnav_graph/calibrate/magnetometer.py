@@ -28,6 +28,7 @@ from smartnav_graph.session.calibration.pieces import Residual, Value
 from smartnav_graph.session.session import Session
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+EARTH_UT, OTHER_UNIT = (22.0, 67.0), 3.0  # strength at its surface; a factor that is no soft iron
 FLAT = 0.15  # least over largest extent of the readings, below which they lie in a plane
 MOST_ROWS = 3000
 FOLDS, GAIN = 5, 0.9
@@ -90,6 +91,14 @@ def fit(sources: Sequence[Session], options: MagnetometerOptions) -> Calibration
         known = float(np.linalg.norm(session.magnetic_field_ut))
     centre, radius = sphere(readings)
     strength = radius if known is None else known
+    weakest, strongest = EARTH_UT if known is None else (known, known)
+    if not weakest / OTHER_UNIT < radius < strongest * OTHER_UNIT:
+        rule = f"{weakest:.3g} uT" if known else "{:g} to {:g} uT, the field of the Earth".format(*EARTH_UT)
+        found, remedy = (
+            f"the readings turn about a field of {radius:.3g}",
+            "import it in uT (--columns), away from iron",
+        )
+        raise CalibrationError(where, found, rule, remedy)
     ball, ellipsoid = _fit(readings, centre, radius, 3, radius), _fit(readings, centre, radius, 9, strength)
     left = {size: _left_out(readings, centre, radius, size, strength if size == 9 else radius) for size in (3, 9)}
     best, size = (ball, 3)

@@ -20,6 +20,7 @@ from smartnav_graph.session.streams import Imu
 BLOCK_S, LEAST_ROWS = 0.25, 10  # length of a block, at least so many readings
 FACTOR = 5.0  # of the level of noise
 MOST_FORCE, MOST_RATE = 0.15, 0.03  # m/s^2, rad/s: scatter (three axes) of the noisiest phone at rest
+FAR = 0.25  # share of gravity by which the median reading at rest may differ from it
 TURNED = 0.02  # rad between the directions of specific force of neighbouring blocks; a rest shows less
 
 
@@ -119,6 +120,14 @@ def check_readings(session: Session, sensors: tuple[str, ...] = ("accel", "gyro"
                     "record with a smaller range, or unfiltered"
                 )
     return warnings
+
+
+def check_unit(session: Session, means: Floats) -> None:
+    """Refuse means (m, 3) of specific force at rest that are far from gravity."""
+    length = float(np.median(np.linalg.norm(means, axis=1)))
+    if abs(length / session.gravity - 1) > FAR:
+        found, remedy = f"specific force at rest is {length:.4g}", "import it in m/s^2 (--columns, --repair units)"
+        raise CalibrationError(session.path or "session", found, f"{session.gravity:.4g} m/s^2", remedy)
 
 
 def _longest(mask: Mask) -> int:

@@ -16,7 +16,7 @@ from scipy.fft import dct
 
 from smartnav_graph.calibrate.allan import allan_deviation, cluster_sizes, confidence_limits
 from smartnav_graph.calibrate.noise import TERMS
-from smartnav_graph.calibrate.rests import RestRows, check_readings, find_rests, interval_s
+from smartnav_graph.calibrate.rests import RestRows, check_readings, check_unit, find_rests, interval_s
 from smartnav_graph.calibrate.result import CalibrationResult, Chart, Series
 from smartnav_graph.calibrate.static_axis import MEANS, AxisAtRest, block_means, characterise
 from smartnav_graph.core import so3
@@ -71,6 +71,7 @@ def fit(sources: Sequence[Session], options: StaticOptions) -> CalibrationResult
     if not rests:
         found = f"no rest of {options.least_rest_s:g} s: the device moved"
         raise CalibrationError(session.path or "session", found, "a device at rest", "put it on a firm table")
+    check_unit(session, np.array([imu.accel[rest.rows].mean(axis=0) for rest in rests]))
     warnings += _moved(session, rests)
     temperature, refused = _temperature(session, rests)
     mean_c = 25.0 if temperature is None else float(np.mean(np.concatenate([temperature[r.rows] for r in rests])))

@@ -100,6 +100,16 @@ def test_bad_recordings_are_named():
         accelerometer.fit([handled(3, rests=3)], ACCEL_OPTIONS)
     with pytest.raises(CalibrationError, match=r"specific force at rest is .*import it in m/s"):
         accelerometer.fit([changed(good, accel=good.imu.accel / G)], ACCEL_OPTIONS)
+    alike = changed(good, accel=np.tile(good.imu.accel[:1], (len(good.imu), 1)) + 0.01 * good.imu.gyro)
+    with pytest.raises(CalibrationError, match=r"rests in 1 attitudes.*each axis up and down"):
+        accelerometer.fit([alike], ACCEL_OPTIONS)
+    with pytest.raises(CalibrationError, match=r"accel_x is clipped at .*set a larger range"):
+        accelerometer.fit([changed(good, accel=np.clip(good.imu.accel, -4, 4))], ACCEL_OPTIONS)
+    with pytest.raises(CalibrationError, match=r"gyro_z is constant \(0\).*check the sensor"):
+        gyro.fit([changed(good, gyro=good.imu.gyro * [1, 1, 0])], OPTIONS)
+    moving = changed(good, accel=good.imu.accel + np.random.default_rng(0).standard_normal(good.imu.accel.shape))
+    with pytest.raises(CalibrationError, match=r"0 rests in 0 attitudes.*hold the device still"):
+        accelerometer.fit([moving], ACCEL_OPTIONS)
     with pytest.raises(CalibrationError, match="look like deg/s"):
         gyro.fit([changed(good, gyro=np.degrees(good.imu.gyro))], OPTIONS)
     with pytest.raises(CalibrationError, match="all axes of the gyro read with the opposite sign"):

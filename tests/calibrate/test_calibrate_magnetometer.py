@@ -82,6 +82,11 @@ def test_bad_recordings_are_named():
     still = replace(good.magnetometer, field_ut=good.magnetometer.field_ut * [1, 0, 1])
     with pytest.raises(CalibrationError, match="y of the magnetometer is constant"):
         magnetometer.fit([good.replace(magnetometer=still)], OPTIONS)
+    for unit, found in ((0.01, r"of 0\.4"), (1000.0, r"of 4.*e\+04")):  # gauss, nT
+        other = replace(good.magnetometer, field_ut=good.magnetometer.field_ut * unit)
+        for session in (good, good.replace(origin=None)):
+            with pytest.raises(CalibrationError, match=f"turn about a field {found}.*import it in uT"):
+                magnetometer.fit([session.replace(magnetometer=other)], magnetometer.MagnetometerOptions())
     with pytest.raises(CalibrationError, match="has no magnetometer"):
         magnetometer.fit([good.replace(magnetometer=None)], OPTIONS)
 

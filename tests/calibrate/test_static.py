@@ -143,6 +143,8 @@ def test_bad_recordings_are_named():
     moved = imu.accel + 3 * np.cumsum(rng.standard_normal((COUNT, 3)), axis=0) * np.sqrt(DT)
     with pytest.raises(CalibrationError, match="the device moved"):
         static.fit([changed(clean, accel=moved)], OPTIONS)
+    with pytest.raises(CalibrationError, match=r"specific force at rest is 1\..*import it in m/s"):
+        static.fit([changed(clean, accel=imu.accel / 9.8)], OPTIONS)
     step = 0.03
     coarse = static.fit([changed(clean, accel=np.round(imu.accel / step) * step)], OPTIONS)
     assert any("accel_x is quantised in steps of 0.03" in text for text in coarse.warnings)
