@@ -19,7 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from smartnav_graph.core.timebase import NS
-from smartnav_graph.estimate.preparation import PREPARE, Notes, PreparationStep
+from smartnav_graph.estimate.notes import Notes, PreparationStep
+from smartnav_graph.estimate.preparation import PREPARE
 from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import WHITE_ACCELERATION, Calibration
 from smartnav_graph.session.session import Device, Mount, Session

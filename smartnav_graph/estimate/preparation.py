@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from smartnav_graph.core.arrays import runs
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import NS, Gap, find_gaps
-from smartnav_graph.estimate.config import Config
-from smartnav_graph.factors.camera import UNKNOWN_CAMERA, readout_s
-from smartnav_graph.factors.context import camera_name
-from smartnav_graph.factors.coplanarity import pairs_of
+from smartnav_graph.estimate.notes import Notes, PreparationStep
+from smartnav_graph.estimate.pictures import compare_camera, match_pictures, pair_images
 from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.pass_state import INITIALISATION_S
 from smartnav_graph.session import health
@@ -32,49 +30,13 @@ from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned, Stream
-from smartnav_graph.vision.gyro_comparison import GyroComparison, compare_with_gyro, contradictions
-from smartnav_graph.vision.pairs import Pairs
+from smartnav_graph.vision.map import SOURCE as OF_A_MODEL
 from smartnav_graph.vision.zero_motion import moving_spans, static_periods
-
-
-@dataclass
-class Notes:
-    """What the steps find beside the session.
-
-    causal : for a replay; span : first and last stamp to smooth; gaps : of the inertial data inside it
-    clocks : comparison of the sensors' clocks; findings : warnings of the health; withheld : rows held out, by stream
-    dropped : rows that are not used, by stream and reason
-    heights : levels of the heights of streams that have another datum, or more than one
-    camera_turns : the camera compared with the gyroscope
-    """
-
-    config: Config
-    causal: bool = False
-    span: tuple[int, int] = (0, 0)
-    gaps: Sequence[Gap] = ()
-    clocks: ClockReport = ClockReport()
-    findings: Sequence[Finding] = ()
-    calibration: Calibration = field(default_factory=Calibration)
-    withheld: Mapping[str, Positioned] = field(default_factory=dict)
-    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-    pairs: Pairs | None = None
-    camera_turns: GyroComparison | None = None
-    rests: Standstills | None = None
-    heights: dict[str, HeightLevels] = field(default_factory=dict)
-
-    def drop(self, reason: str, counts: Mapping[str, int]) -> None:
-        """Count rows that are not used, by stream."""
-        for name, count in counts.items():
-            self.dropped.setdefault(name, {})[reason] = count
-
 
 # Scatter of positions, in units of their sigmas, beyond which these are not believed; smaller scatter may be a motion.
 CLAIM, LEAST_SCATTER_M, LEAST_SCATTERED = 2.0, 0.5, 20
 # Heights lie off surveyed points by another datum where they do by so many times what that varies.
 OTHER_DATUM = 4.0
-
-PreparationStep = Callable[[Session, Notes], Session]
 
 
 def choose_span(session: Session, notes: Notes) -> Session:
@@ -173,7 +135,8 @@ def calibrate(session: Session, notes: Notes) -> Session:
 
 
 def choose_sensors(session: Session, notes: Notes) -> Session:
-    """Only the named sensors, or all but those with a leading minus; the inertial data always stay."""
+    """Only the named sensors, or all but those with a leading minus; the inertial data always stay. `images` stands for
+    all that they gave: matches, tracks, and the pose fixes of a model."""
     chosen = notes.config.run.sensors
     if not chosen:
         return session
@@ -184,8 +147,16 @@ def choose_sensors(session: Session, notes: Notes) -> Session:
         raise ConfigError("--sensors", f"{', '.join(unknown)} not in this session", f"some of {', '.join(there)}")
     wanted = {name for name in chosen if not name.startswith("-")}
     unwanted = {name[1:] for name in chosen if name.startswith("-")}
+    of_images = {"matches", "tracks"}
+    wanted |= of_images if "images" in wanted else set()
+    unwanted |= of_images if "images" in unwanted else set()
     keep = (wanted or set(there)) - unwanted | {"imu", "reference", "images"}
-    return session.replace(**{name: None for name in there if name not in keep})
+    session = session.replace(**{name: None for name in there if name not in keep})
+    fixes = session.pose_fixes
+    if "images" not in unwanted or fixes is None or fixes.source is None:
+        return session
+    own = fixes.source.astype(str) != OF_A_MODEL
+    return session.replace(pose_fixes=fixes.take(own) if own.any() else None)
 
 
 def check_sigmas(session: Session, notes: Notes) -> Session:
@@ -298,27 +269,6 @@ def trim_span(session: Session, notes: Notes) -> Session:
     return session
 
 
-def pair_images(session: Session, notes: Notes) -> Session:
-    """Image pairs, where images are used."""
-    notes.pairs = pairs_of(session, notes.config.image_pairs, smart=notes.config.smart.enabled)
-    return session
-
-
-def compare_camera(session: Session, notes: Notes) -> Session:
-    """The camera beside the gyroscope. In a replay by what is known at first."""
-    if notes.pairs is None:
-        return session
-    pairs, name = notes.pairs, camera_name(session, notes.calibration)
-    camera = notes.calibration.cameras.get(name, UNKNOWN_CAMERA)
-    if notes.causal:
-        pairs = pairs.until(notes.span[0] + round(INITIALISATION_S * NS))
-    rows_s = readout_s(session, name, notes.calibration.cameras.get(name)) * notes.config.image_pairs.row_time
-    notes.camera_turns = compare_with_gyro(pairs, session.require_imu(), camera, session.mount(name), 0.5 * rows_s)
-    for finding in contradictions(notes.camera_turns, camera):
-        notes.findings, notes.warnings = [*notes.findings, finding], [*notes.warnings, str(finding)]
-    return session
-
-
 def detect_standstills(session: Session, notes: Notes) -> Session:
     """Standstills and stances by inertial data, listed spans and images."""
     vehicle = notes.config.run.vehicle or session.device.vehicle
@@ -375,6 +325,7 @@ PREPARE: Mapping[str, PreparationStep] = {
     "spikes": drop_spikes,
     "calibration": calibrate,
     "sensors": choose_sensors,
+    "pictures": match_pictures,
     "latency": undo_latencies,
     "heights": level_heights,
     "holdout": withhold,

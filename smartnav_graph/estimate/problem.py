@@ -9,11 +9,13 @@ import numpy as np
 
 from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import ConfigError
+from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.core.tables import check
 from smartnav_graph.core.timebase import NS, Gap
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.constant_velocity import PREPARE_POSITIONS
-from smartnav_graph.estimate.preparation import PREPARE, Notes, on_one_datum
+from smartnav_graph.estimate.notes import Notes
+from smartnav_graph.estimate.preparation import PREPARE, on_one_datum
 from smartnav_graph.factors import FACTORS, make_builders
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import delayed
@@ -29,6 +31,7 @@ from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
 from smartnav_graph.session.streams import Imu
+from smartnav_graph.vision.front_end import FrontEndReport
 from smartnav_graph.vision.gyro_comparison import GyroComparison
 from smartnav_graph.vision.pairs import Pairs
 
@@ -57,6 +60,7 @@ class Problem(Summarised):
     findings: Sequence[Finding] = ()
     heights: Mapping[str, HeightLevels] = field(default_factory=dict)
     camera_turns: GyroComparison | None = None
+    pictures: FrontEndReport | None = None
 
     def facts(self) -> dict[str, str]:
         """Windows, data gaps, builders."""
@@ -97,7 +101,7 @@ class Problem(Summarised):
         return bool(np.isfinite(rests.over(rests.turn_sigma, at, at)))
 
 
-def prepare(session: Session, config: Config, *, causal: bool = False) -> Problem:
+def prepare(session: Session, config: Config, *, causal: bool = False, progress: Progress = silent) -> Problem:
     """The steps of `PREPARE`, or of `PREPARE_POSITIONS` where there are no inertial data, then windows and builders.
 
     causal : a row is used when it becomes known (replay); otherwise at its measurement time
@@ -109,7 +113,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     ConfigError
         An option names what is not there.
     """
-    notes = Notes(check(config, ConfigError, "options"), causal)
+    notes = Notes(check(config, ConfigError, "options"), causal, progress)
     positions_only = session.imu is None and bool(session.positions())
     for step in (PREPARE_POSITIONS if positions_only else PREPARE).values():
         session = step(session, notes)
@@ -132,7 +136,7 @@ def prepare(session: Session, config: Config, *, causal: bool = False) -> Proble
     return Problem(
         *(session, config, notes.calibration, context.bridged_imu, windows, notes.gaps, builders),
         *(notes.withheld, notes.dropped, notes.warnings, notes.rests, notes.pairs, notes.clocks, notes.findings),
-        *(notes.heights, notes.camera_turns),
+        *(notes.heights, notes.camera_turns, notes.pictures),
     )
 
 
@@ -184,11 +188,7 @@ def unused_streams(session: Session) -> list[str]:
     """Warnings of streams that no factor uses."""
     used = {factor.stream for factor in FACTORS.values()} | {"reference", "images"}
     idle = [name for name in session.streams() if name not in used]
-    warnings = [f"{name}: present, not used by the estimator" for name in idle]
-    images = session.images
-    if images is not None and session.matches is None and session.tracks is None and images.file.astype(bool).any():
-        warnings.append(f"images: {len(images)} pictures are not matched yet, and not used; run `smartnav match` first")
-    return warnings
+    return [f"{name}: present, not used by the estimator" for name in idle]
 
 
 def dropped_text(name: str, counts: Mapping[str, int]) -> str:

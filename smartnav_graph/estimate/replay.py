@@ -36,7 +36,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     """
     clock = StageTimes()
     progress("preparing", 0, 0)
-    problem = prepare(session, config or Config(), causal=True)
+    problem = prepare(session, config or Config(), causal=True, progress=progress)
     clock.lap("prepare")
     progress("finding the start", 0, 0)
     initial = initialise(problem, longest_s=INITIALISATION_S)

@@ -139,7 +139,7 @@ def smooth(session: Session, config: Config | None = None, *, progress: Progress
     """
     clock = StageTimes()
     progress("preparing", 0, 0)
-    problem = prepare(session, config or Config())
+    problem = prepare(session, config or Config(), progress=progress)
     clock.lap("prepare")
     progress("finding the start", 0, 0)
     initial = initialise(problem)

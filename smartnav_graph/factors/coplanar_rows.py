@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Mask
-from smartnav_graph.core.so3 import exp, right_jacobian, rotate, skew
+from smartnav_graph.core.so3 import exp, log, right_jacobian, rotate, skew
 from smartnav_graph.graph.robust import loss_weights
 from smartnav_graph.graph.update import Measured
 from smartnav_graph.vision.epipolar import Sampson, cross, essential, rays, sampson
@@ -217,7 +217,8 @@ class CompressedRows(Matched):
     other. Where the matches have shifts d of their own in the baseline, the constant x0~^T [d]x R x1~ of each, R where
     it was compressed, is a tenth column beside vec(E).
 
-    shared : sigma (rad) of the direction of a baseline beside the noise of its matches
+    shared : sigma (rad) of the direction of a baseline beside the noise of its matches. With one the rows are linear in
+    rotation and direction from where they were compressed: entries of E are not, over degrees of a stiff pair.
     """
 
     def __init__(
@@ -239,8 +240,9 @@ class CompressedRows(Matched):
         total = np.maximum((square * weight).sum(axis=1), 1e-300)
         self.length = _lengths(a, b, weight) / total[:, None, None]
         self.floor = BASELINE_FLOOR_M**2 * weight.sum(axis=1) / total
+        self._shared: _Linear | None = None
         if shared > 0.0:
-            self.root = self._with_shared_error(shared, frozen)
+            self._shared = self._with_shared_error(shared, frozen)
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         rows = data[:, 0].astype(np.intp)
@@ -250,6 +252,8 @@ class CompressedRows(Matched):
 
     def _missed(self, rows: NDArray[np.intp], there: Relative) -> tuple[Floats, Floats]:
         """Residuals (m, 9) of some pairs, and their derivatives (m, 9, 6) by the relative pose."""
+        if self._shared is not None:
+            return self._shared.missed(rows, there)
         e, by_e = _vectorised(there.R, there.t)
         N, root = self.length[rows], self.root[rows]
         Ne = rotate(N, e)
@@ -260,18 +264,40 @@ class CompressedRows(Matched):
         by = at_e / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
         return r, by @ by_e
 
-    def _with_shared_error(self, sigma: float, frozen: Relative) -> Floats:
+    def _with_shared_error(self, sigma: float, frozen: Relative) -> _Linear:
         """The rows whitened beside an error that all matches of a pair share: of the direction of the baseline, `sigma`
-        rad, and of the rotation, a share of it. With A the derivatives by the relative pose,
+        rad, and of the rotation, a share of it. With A the derivatives by rotation and unit direction u,
 
-            Q = diag(s_R^2 1, sigma^2 (|t|^2 1 - t t^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
+            Q = diag(s_R^2 1, sigma^2 (1 - u u^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
         """
-        t, (_, A) = frozen.t, self._missed(np.arange(len(self.root)), frozen)
-        Q = np.zeros((len(t), 6, 6))
+        r, A = self._missed(np.arange(len(self.root)), frozen)
+        size = np.maximum(np.linalg.norm(frozen.t, axis=1), BASELINE_FLOOR_M)[:, None]
+        A[:, :, 3:] *= size[:, :, None]
+        u = frozen.t / size
+        Q = np.zeros((len(u), 6, 6))
         Q[:, :3, :3] = (TURN_SHARE * sigma) ** 2 * np.eye(3)
-        across = (t**2).sum(axis=1)[:, None, None] * np.eye(3) - t[:, :, None] * t[:, None, :]
-        Q[:, 3:, 3:] = sigma**2 * across
-        return np.linalg.solve(np.linalg.cholesky(np.eye(9) + A @ Q @ A.transpose(0, 2, 1)), self.root)
+        Q[:, 3:, 3:] = sigma**2 * (np.eye(3) - u[:, :, None] * u[:, None, :])
+        white = np.linalg.inv(np.linalg.cholesky(np.eye(9) + A @ Q @ A.transpose(0, 2, 1)))
+        return _Linear(rotate(white, r), white @ A, frozen.R, u)
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Rows r + A [log(R0^T R), t / |t| - u0] of pairs: r (n, 9), A (n, 9, 6), R0 (n, 3, 3), u0 (n, 3)."""
+
+    r: Floats
+    A: Floats
+    R: Floats
+    u: Floats
+
+    def missed(self, rows: NDArray[np.intp], there: Relative) -> tuple[Floats, Floats]:
+        """As `CompressedRows._missed`."""
+        size = np.sqrt((there.t**2).sum(axis=1) + BASELINE_FLOOR_M**2)[:, None]
+        u, turn = there.t / size, log(self.R[rows].transpose(0, 2, 1) @ there.R)
+        A, by = self.A[rows], np.zeros((len(rows), 6, 6))
+        by[:, :3, :3] = np.linalg.inv(right_jacobian(turn))
+        by[:, 3:, 3:] = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, :, None]
+        return self.r[rows] + rotate(A, np.concatenate([turn, u - self.u[rows]], axis=1)), A @ by
 
 
 def _lengths(a: Floats, b: Floats, weight: Floats) -> Floats:

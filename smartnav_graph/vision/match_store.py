@@ -80,6 +80,16 @@ def refuse_existing_stream(folder: Path, name: str, force: bool) -> None:
         raise SessionError(file, "exists already", "a session without it", REMEDY, stream=name)
 
 
+def stored_report(folder: Path) -> FrontEndReport | None:
+    """What became of the pictures that the matches or tracks of a session folder were made of, where it says so."""
+    for file in (folder / "matches.toml", folder / "tracks.toml"):
+        try:
+            return FrontEndReport(**tomllib.loads(file.read_text(encoding="utf-8"))["report"])
+        except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError):
+            continue
+    return None
+
+
 def _stored_report(folder: Path, name: str, wanted: Mapping[str, object]) -> dict[str, Any]:
     """The report of stored rows, if they were made with the options wanted."""
     file = folder / f"{name}.parquet"

@@ -124,20 +124,6 @@ def test_without_inertial_data(eight):
         prepare(eight.replace(imu=None, gnss=None), Config())
 
 
-def test_pictures_that_nobody_matched_are_told():
-    from smartnav_graph.session.streams import Images
-    from smartnav_graph.simulation.scenarios import simulate
-
-    session = simulate("figure-eight-60s", 0)
-    rows = session.imu.t_ns[:300:100]
-    names = np.array(["a.png", "b.png", "c.png"], dtype=object)
-    images = Images(t_ns=rows, image_id=np.arange(3), file=names, camera=np.full(3, "cam", dtype=object))
-    warnings = prepare(session.replace(images=images), Config()).warnings
-    assert "images: 3 pictures are not matched yet, and not used; run `smartnav match` first" in warnings
-    nameless = replace(images, file=np.full(3, "", dtype=object))
-    assert not any("not matched" in text for text in prepare(session.replace(images=nameless), Config()).warnings)
-
-
 def test_each_step_of_the_preparation_stands_alone(eight):
     notes = Notes(Config(run=RunConfig(start_s=5.0, end_s=20.0)))
     session = PREPARE["span"](eight, notes)

@@ -7,6 +7,7 @@ import resource
 import sys
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -128,6 +129,7 @@ def summarise(
         "states": _states(solved),
         "clock": problem.clocks.to_dict(),
         "camera": _camera(problem, pass_state),
+        **({} if problem.pictures is None else {"pictures": asdict(problem.pictures)}),
         "timings_s": {name: round(value, 4) for name, value in timings.items()},
         "real_time_factor": round(duration / max(timings["total"], 1e-9), 2),
         "peak_memory_mb": round(peak_memory_mb(), 1),

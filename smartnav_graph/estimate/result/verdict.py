@@ -28,6 +28,7 @@ from smartnav_graph.estimate.reweight.image_pair_outliers import pair_account
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
+from smartnav_graph.factors.coplanarity import SHARED
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA
@@ -265,6 +266,10 @@ def _images(inputs: VerdictInputs) -> Iterator[Reason]:
         text = f"{100 * share:.0f} % of the image pairs contradict the other sensors{none}"
         remedy = "check clock and calibration of the camera, or add fixes, control points or standstills"
         yield Reason(LEVELS[1], "image_pairs", text, remedy, share)
+    turned = inputs.solved.pass_state.noise_scales.get(SHARED, 0.0)
+    if turned:
+        text = f"image pairs and the other sensors agree only to {np.degrees(turned):.1f} deg of the direction of motion"
+        yield Reason(LEVELS[1], "image_pairs", text, "check clock and calibration of the camera", turned)
 
 
 def _biases(inputs: VerdictInputs) -> Iterator[Reason]:

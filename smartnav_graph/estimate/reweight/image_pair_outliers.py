@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smartnav_graph.core.arrays import Floats, Mask
+from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.factors.camera import BORESIGHT, STREAM, CameraModel, Motion
 from smartnav_graph.factors.coplanar_rows import COLUMNS, Relative, relative
 from smartnav_graph.factors.coplanarity import (
@@ -44,6 +44,24 @@ LARGEST_SIGMA, FEW_DIVERGED = 0.3, 0.1
 SCALES = (0.3, 3.0)
 
 
+# Name, among the selections of a pass, of the positions found without images.
+WITHOUT_IMAGES = "without_images"
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Of keyframes: stamps t_ns (n,), p (n, 3) m and their covariance P (n, 3, 3), nav axes."""
+
+    t_ns: Times
+    p: Floats
+    P: Floats
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> Positions:
+        """By an estimate."""
+        return cls(estimate.t_ns, estimate.states()[1], estimate.covariance[:, 3:6, 3:6])
+
+
 def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
     """The pass state with the matches that agree with an estimate; unchanged once they are all tested."""
     builder = one_of(builders, CoplanarityBuilder)
@@ -69,11 +87,14 @@ def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: Pas
         "matches": frozenset(np.flatnonzero(~np.asarray(selection.pairs.flat(use))).tolist()),
         builder.name: frozenset(np.flatnonzero(verdict != IN_USE).tolist()),
     }
+    selections = {**pass_state.selections, builder.name: selection}
+    if tests == 0 and not estimate.stacks(builder.name):
+        selections[WITHOUT_IMAGES] = Positions.of(estimate)
     return replace(
         pass_state,
         rejected={**pass_state.rejected, **rejected},
         noise_scales={**pass_state.noise_scales, builder.name: scale},
-        selections={**pass_state.selections, builder.name: selection},
+        selections=selections,
         outlier_tests={**pass_state.outlier_tests, builder.name: COMPRESSED if refused else tests + 1},
     )
 

@@ -3,19 +3,25 @@
 Residuals of matches show the noise of a match. What is wrong with a pair as a whole, or lasts over many (calibration,
 motion within the exposure, one observation in pairs of several spans), they do not show: it bends the solution until
 inertial data and fixes contradict their noise. So an error of direction that the matches of a pair share is assumed to
-be the larger, the more these do, by the chi-square of each over its own redundancy.
+be the larger, the more these do, by the chi-square of each over its own redundancy, and by the change d of positions
+p0, P0 that were found without images: where nothing is wrong its covariance is P0 - P <= P0. What images contradict
+at the largest error, they are not used beside.
+
+Source: Hausman (1978), Specification tests in econometrics, Econometrica 46, 1251, for the change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
+from smartnav_graph.estimate.reweight.image_pair_outliers import WITHOUT_IMAGES, Positions
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.coplanarity import COMPRESSED, COPIED, IN_USE, SHARED, CoplanarityBuilder
+from smartnav_graph.factors.coplanarity import CONTRARY as CONTRARY_PAIR
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.update import Builder, one_of
@@ -25,8 +31,11 @@ from smartnav_graph.smoothers.redundancy import redundancies
 # Chi-square over redundancy from which on a sensor contradicts the images, how rarely one that agrees reaches it.
 CONTRARY, RARE = 1.1, 1e-3
 # First and largest sigma of the direction, rad, and the least and most that it grows by in a pass.
-FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(2.0))
-STEP = (1.3, 3.0)
+FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(5.0))
+STEP = (1.6, 3.0)
+# Mean square of the change of horizontal positions by images, in units of their variance without, beyond which it is
+# no gain of information.
+CHANGED = 1.0
 
 
 def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
@@ -35,17 +44,48 @@ def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: Pa
     pairs = one_of(builders, CoplanarityBuilder)
     if pairs is None or pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused:
         return pass_state
-    imu = one_of(builders, ImuBuilder)
-    names = {builder.name for builder in position_builders(builders)} | ({imu.name} if imu is not None else set())
-    found = [one for name, one in redundancies(estimate).items() if name in names]
-    fits = [(one.square, one.residuals - one.fitted) for one in found]
-    worst = max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < RARE), default=1.0)
+    worst = max(_misfit(builders, estimate), _change(estimate, pass_state))
     before = pass_state.noise_scales.get(SHARED, 0.0)
-    if worst < CONTRARY or before >= LARGEST:
+    if worst < CONTRARY:
         return pass_state
+    if before >= LARGEST:
+        return _refused(pairs, pass_state)
     wanted = FIRST if before == 0.0 else min(before * float(np.clip(np.sqrt(worst), *STEP)), LARGEST)
     pass_state = replace(pass_state, noise_scales={**pass_state.noise_scales, SHARED: wanted})
     return _counted_once(pairs, pass_state) if before == 0.0 else pass_state
+
+
+def _misfit(builders: Sequence[Builder], estimate: Estimate) -> float:
+    """Largest chi-square over redundancy of inertial data and fixes that is no chance; 1 where there is none."""
+    imu = one_of(builders, ImuBuilder)
+    names = {builder.name for builder in position_builders(builders)} | ({imu.name} if imu is not None else set())
+    fits = [(f.square, f.residuals - f.fitted) for name, f in redundancies(estimate).items() if name in names]
+    return max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < RARE), default=1.0)
+
+
+def _change(estimate: Estimate, pass_state: PassState) -> float:
+    """Mean square of the change of horizontal positions since the solution without images, in units of its variance.
+    Not what a clock offset of the fixes changes; nothing is known where these have correlated errors since."""
+    before = pass_state.selections.get(WITHOUT_IMAGES)
+    if not isinstance(before, Positions) or pass_state.correlated:
+        return 0.0
+    now = Positions.of(estimate)
+    _, old, new = np.intersect1d(before.t_ns, now.t_ns, return_indices=True)
+    d, v = (now.p[new] - before.p[old])[:, :2], estimate.states()[2][new, :2]
+    d = d - v * (v * d).sum() / max(float((v**2).sum()), 1e-12)
+    square = (d * np.linalg.solve(before.P[old, :2, :2], d[:, :, None])[:, :, 0]).sum(axis=1)
+    return float(square.mean()) / 2.0 / CHANGED if len(square) else 0.0
+
+
+def _refused(pairs: CoplanarityBuilder, pass_state: PassState) -> PassState:
+    """The pass state without any pair."""
+    selection = pairs.selection(pass_state)
+    text = "image_pairs: refused, they contradict inertial data and fixes; check clock and calibration of the camera"
+    verdict = np.where(selection.verdict == IN_USE, CONTRARY_PAIR, selection.verdict)
+    selection = replace(selection, verdict=verdict, use=np.zeros_like(selection.use), refused=text)
+    scales = {name: scale for name, scale in pass_state.noise_scales.items() if name != SHARED}
+    selections = {**pass_state.selections, pairs.name: selection}
+    return replace(pass_state, selections=selections, noise_scales=scales)
 
 
 def weight_text(pass_state: PassState) -> list[str]:

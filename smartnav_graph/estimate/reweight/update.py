@@ -205,7 +205,8 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
         return replace(pass_state, stage=LAST_STAGE, correlated=correlated) if later else pass_state
-    may_last = [builder for builder in positions if builder.noise.is_correlated]
+    # Not by a solution with images: what is wrong with these would be taken for errors of the fixes.
+    may_last = [builder for builder in positions if builder.noise.is_correlated and not pass_state.outlier_tests]
     correlated |= lasting_errors(may_last, estimate, replace(pass_state, correlated=pass_state.correlated | correlated))
     blind = {
         state.name: state.prior_mean
