@@ -142,7 +142,7 @@ def next_pass(
         pass_state=updated,
         initial_values=estimate.values,
         start_error_m=0.0,
-        causal_start=second_stage and diverged,
+        causal_start=diverged,
     )
     if pass_.coarse_start:
         return following
@@ -217,7 +217,7 @@ def solve_passes(
         if clock is not None:
             clock.pass_done(estimate, _preintegration_s(problem) - before_s)
         updated, done = update_pass_state(problem.builders, windows, estimate, pass_.pass_state)
-        joins = updated.stage > pass_.pass_state.stage
+        joins = bool(updated.outlier_tests) and not pass_.pass_state.outlier_tests
         diverged = joins and images_diverged(problem.builders, estimate, updated)
         following = next_pass(pass_, estimate, updated, done=done, diverged=diverged)
         if following is None:

@@ -21,9 +21,12 @@ from smartnav_graph.graph.pass_state import INITIALISATION_S, LAST_STAGE, PassSt
 from smartnav_graph.session.session import Session
 from smartnav_graph.smoothers import incremental
 from smartnav_graph.smoothers.estimate import Estimate, state_distance, states_of
+from smartnav_graph.smoothers.incremental import ReplayConfig
 
 # A polish that moves a state further than this starts again from what it found.
 FAR_M, FAR_DEG = 0.1, 1.0
+# Share of the usual steps after which iSAM2 linearises states anew, with image pairs.
+EARLIER = 0.1
 
 
 def replay(session: Session, config: Config | None = None, *, progress: Progress = silent) -> Run:
@@ -41,7 +44,7 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
     progress("finding the start", 0, 0)
     initial = initialise(problem, longest_s=INITIALISATION_S)
     clock.lap("initialise")
-    smoother = incremental(problem.config.replay, problem.session.t0_ns)
+    smoother = incremental(_smoother_config(problem), problem.session.t0_ns)
     builders, log = [initial.prior.with_position(), *problem.builders], UpdateLog(smoother)
     windows, pass_state = watched("replay", problem.windows, progress), _causal(problem, initial)
     pass_state = run_pass(smoother, windows, builders, pass_state, log.take, interruptible=True)
@@ -69,6 +72,14 @@ def replay(session: Session, config: Config | None = None, *, progress: Progress
         clock.lap("polish")
     run = _finish(SolvedProblem(problem, estimate, pass_state), initial, clock, extra, causal, updates)
     return replace(run, causal_windows=causal_windows)
+
+
+def _smoother_config(problem: Problem) -> ReplayConfig:
+    """In iSAM2 the matches of a pair keep the weights under their loss of the state that they were last linearised at:
+    with image pairs states are linearised anew after smaller steps."""
+    config = problem.config.replay
+    earlier = config.smoother == "isam2" and problem.pairs is not None
+    return replace(config, relinearize=config.relinearize * EARLIER) if earlier else config
 
 
 def _causal(problem: Problem, initial: InitialState) -> PassState:

@@ -12,7 +12,7 @@ from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.estimate.reweight.track_outliers import POINT_DOF
 from smartnav_graph.factors import builder_of
-from smartnav_graph.factors.coplanarity import SMART
+from smartnav_graph.factors.coplanarity import SHARED, SMART
 from smartnav_graph.graph.robust import expected_weighted_square
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
@@ -20,7 +20,8 @@ from smartnav_graph.smoothers.redundancy import CALIBRATION, redundancies
 # Redundancy below which a sum of squares has no information on a sensor's noise.
 LEAST_REDUNDANCY = 1.0
 # Factors of many measurements, matches or observations of tracks, each of which has a residual. Those in
-# use are inside their gate and count in full: under their loss the sum would be too small.
+# use are inside their gate and count in full: under their loss the sum would be too small. Not so beside an error that
+# the matches of a pair share: it is in their residuals, and not in those of the rows.
 IMAGES = ("image_pairs", SMART)
 
 
@@ -72,7 +73,8 @@ def chi2_of(solved: SolvedProblem, solution: Solution, tracks: Account | None) -
         count, square = found.residuals, found.square / _expected(solved, name)
         if name in IMAGES:
             rows = solution.residuals.of(name) & solution.residuals.used
-            count, square = int(rows.sum()), float((solution.residuals.whitened[rows] ** 2).sum())
+            count, whole = int(rows.sum()), float((solution.residuals.whitened[rows] ** 2).sum())
+            square = square if solved.pass_state.noise_scales.get(SHARED) else whole
         count -= _unknown_heights(solved, name)
         if name == SMART and tracks is not None:
             count -= POINT_DOF * tracks.used

@@ -28,14 +28,15 @@ from smartnav_graph.graph.update import Builder, one_of
 from smartnav_graph.smoothers.estimate import Estimate
 from smartnav_graph.smoothers.redundancy import redundancies
 
-# Chi-square over redundancy from which on a sensor contradicts the images, how rarely one that agrees reaches it.
+# Chi-square over redundancy from which on a sensor contradicts the images, how rarely one that agrees reaches it. Once
+# one did, the error is to be the likely one, not the least that is not excluded.
 CONTRARY, RARE = 1.1, 1e-3
 # First and largest sigma of the direction, rad, and the least and most that it grows by in a pass.
 FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(5.0))
 STEP = (1.6, 3.0)
-# Mean square of the change of horizontal positions by images, in units of their variance without, beyond which it is
-# no gain of information.
-CHANGED = 1.0
+# Mean square of the change of positions by images over what it has by their gain of information, from which it is none:
+# changes are alike for long. Least share of the variance that counts as a gain.
+CHANGED, LEAST_GAIN = 2.0, 0.1
 
 
 def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
@@ -44,9 +45,10 @@ def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: Pa
     pairs = one_of(builders, CoplanarityBuilder)
     if pairs is None or pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused:
         return pass_state
-    worst = max(_misfit(builders, estimate), _change(estimate, pass_state))
     before = pass_state.noise_scales.get(SHARED, 0.0)
-    if worst < CONTRARY:
+    contrary, rare = (CONTRARY, RARE) if before == 0.0 else (1.0, 0.5)
+    worst = max(_misfit(builders, estimate, rare), _change(estimate, pass_state))
+    if worst <= contrary:
         return pass_state
     if before >= LARGEST:
         return _refused(pairs, pass_state)
@@ -55,26 +57,25 @@ def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: Pa
     return _counted_once(pairs, pass_state) if before == 0.0 else pass_state
 
 
-def _misfit(builders: Sequence[Builder], estimate: Estimate) -> float:
-    """Largest chi-square over redundancy of inertial data and fixes that is no chance; 1 where there is none."""
+def _misfit(builders: Sequence[Builder], estimate: Estimate, rare: float) -> float:
+    """Largest chi-square over redundancy of inertial data and fixes that is `rare`; 1 where there is none."""
     imu = one_of(builders, ImuBuilder)
     names = {builder.name for builder in position_builders(builders)} | ({imu.name} if imu is not None else set())
     fits = [(f.square, f.residuals - f.fitted) for name, f in redundancies(estimate).items() if name in names]
-    return max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < RARE), default=1.0)
+    return max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < rare), default=1.0)
 
 
 def _change(estimate: Estimate, pass_state: PassState) -> float:
-    """Mean square of the change of horizontal positions since the solution without images, in units of its variance.
-    Not what a clock offset of the fixes changes; nothing is known where these have correlated errors since."""
+    """Mean square of the change of horizontal positions since the solution without images, over what it may be."""
     before = pass_state.selections.get(WITHOUT_IMAGES)
-    if not isinstance(before, Positions) or pass_state.correlated:
+    if not isinstance(before, Positions):
         return 0.0
     now = Positions.of(estimate)
     _, old, new = np.intersect1d(before.t_ns, now.t_ns, return_indices=True)
-    d, v = (now.p[new] - before.p[old])[:, :2], estimate.states()[2][new, :2]
-    d = d - v * (v * d).sum() / max(float((v**2).sum()), 1e-12)
-    square = (d * np.linalg.solve(before.P[old, :2, :2], d[:, :, None])[:, :, 0]).sum(axis=1)
-    return float(square.mean()) / 2.0 / CHANGED if len(square) else 0.0
+    d, P0 = (now.p[new] - before.p[old])[:, :2], before.P[old, :2, :2]
+    square = (d * np.linalg.solve(P0, d[:, :, None])[:, :, 0]).sum(axis=1).mean()
+    gained = 2.0 - np.trace(np.linalg.solve(P0, now.P[new, :2, :2]), axis1=1, axis2=2).mean()
+    return float(square / max(gained, 2.0 * LEAST_GAIN) / CHANGED)
 
 
 def _refused(pairs: CoplanarityBuilder, pass_state: PassState) -> PassState:

@@ -34,6 +34,7 @@ from smartnav_graph.estimate.reweight.outliers import (
     verdicts,
 )
 from smartnav_graph.estimate.reweight.track_outliers import ROUNDS, check_tracks
+from smartnav_graph.factors.coplanarity import CoplanarityBuilder
 from smartnav_graph.factors.gnss import PositionBuilder
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.factors.smart import SmartBuilder
@@ -84,7 +85,7 @@ def update_pass_state(
 ) -> tuple[PassState, bool]:
     """The pass state of the next pass, and whether nothing changed."""
     new, done = _update_noise_and_fixes(builders, windows, estimate, pass_state)
-    if new.stage < LAST_STAGE:
+    if new.stage < LAST_STAGE or (not done and _images_wait(builders, pass_state)):
         return new, done
     tested = check_pairs(builders, estimate, new)
     tested = check_tracks(builders, estimate, tested) if tested is new else tested
@@ -92,6 +93,12 @@ def update_pass_state(
     if done and tested is new:
         tested = drop_standstills(builders, windows, estimate, new)
     return tested, done and tested is new
+
+
+def _images_wait(builders: Sequence[Builder], pass_state: PassState) -> bool:
+    """Whether image pairs join only once nothing changes without them: what they change then, they change alone."""
+    pairs = one_of(builders, CoplanarityBuilder)
+    return pairs is not None and not pass_state.tests(pairs.name) and bool(position_builders(builders))
 
 
 def _update_noise_and_fixes(
