@@ -21,15 +21,15 @@ from smartnav_graph.session.detect.motion import levelled_motion
 from smartnav_graph.session.detect.moving import Moving, find_moving, without_moving
 from smartnav_graph.session.detect.out_of_reach import out_of_reach
 from smartnav_graph.session.detect.scatter import scatter
-from smartnav_graph.session.detect.standstills import Standstills, find_standstills
-from smartnav_graph.session.health.clocks import ClockReport, apply_offsets, compare_clocks
+from smartnav_graph.session.detect.standstills import find_standstills
+from smartnav_graph.session.health.clocks import apply_offsets, compare_clocks
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.health.inertial import spikes
 from smartnav_graph.session.health.positions import reach_finding
 from smartnav_graph.session.health.units import without_wrong_units
 from smartnav_graph.session.holdout import split
 from smartnav_graph.session.session import Session
-from smartnav_graph.session.stream import Positioned, Stream
+from smartnav_graph.session.stream import Stream
 from smartnav_graph.vision.map import SOURCE as OF_A_MODEL
 from smartnav_graph.vision.zero_motion import moving_spans, static_periods
 

@@ -22,6 +22,7 @@ from smartnav_graph.session.streams import Imu
 # States of the camera belong to this stream; the name of its correction in the body.
 STREAM = "images"
 BORESIGHT = "camera_boresight_rad"
+FOCAL = "camera_focal_length_correction"
 # A camera's clock offset (s) is looked up in the rates over at least so long; replay looks ahead by that.
 AROUND_S = 0.005
 # Least sigma (s) of a clock that the gyroscope shows.
@@ -83,7 +84,8 @@ class CameraModel:
     """The camera of a session as its factors take it.
 
     camera : its calibration, or a substitute; readout_s : from its first row to its last, zero where rows
-    are taken as seen at once; boresight_sigma rad, clock_sigma s : priors of its states, zero for none
+    are taken as seen at once; boresight_sigma rad, clock_sigma s, focal_sigma (relative) : priors of its states, zero
+    for none
     expected_boresight (3,) rad : the boresight that is expected
     """
 
@@ -92,6 +94,7 @@ class CameraModel:
     readout_s: float
     boresight_sigma: float
     clock_sigma: float
+    focal_sigma: float = 0.0
     expected_boresight: Floats = field(default_factory=lambda: np.zeros(3))
 
     def states(self) -> Mapping[str, SessionState]:
@@ -101,6 +104,8 @@ class CameraModel:
             found["T"] = clock_state(STREAM, self.clock_sigma, self.rig.known_s)
         if self.rig.boresight:
             found["A"] = SessionState("A", STREAM, BORESIGHT, self.expected_boresight, np.full(3, self.boresight_sigma))
+        if self.rig.focal:
+            found["I"] = SessionState("I", STREAM, FOCAL, np.zeros(1), np.array([self.focal_sigma]))
         return found
 
     @property
@@ -135,22 +140,30 @@ def seen_from(xy_n: Floats, turn: Floats) -> Floats:
 
 
 def make_camera_model(
-    context: FactorContext, boresight_sigma_deg: float | None, time_offset_sigma: float | None, row_time: bool
+    context: FactorContext,
+    boresight_sigma_deg: float | None,
+    time_offset_sigma: float | None,
+    focal_sigma: float | None,
+    row_time: bool,
 ) -> CameraModel:
-    """The camera of a session; prior sigmas deg and s (None: as calibrated), whether rows have their own time."""
+    """The camera of a session; prior sigmas deg, s and relative (None: as calibrated), whether rows have their own
+    time."""
     camera = context.camera or UNKNOWN_CAMERA
     mount = context.session.mount(context.camera_name)
     degrees = camera.boresight_sigma_deg if boresight_sigma_deg is None else boresight_sigma_deg
     seconds = camera.time_offset_sigma_s if time_offset_sigma is None else time_offset_sigma
+    focal = camera.focal_sigma if focal_sigma is None else focal_sigma
     body_R, body_t = np.array(mount.body_R, dtype=np.float64), np.array(mount.body_t, dtype=np.float64)
     expected_boresight, seen = np.zeros(3), context.camera_turns
     if seen is not None and context.camera_offset_s and seconds > 0:
         seconds = max(seen.sigma_s, LEAST_CLOCK_SIGMA_S)
     if seen is not None and degrees > 0 and seen.turned_by > np.radians(degrees):
         expected_boresight = seen.certain_boresight
-    rig = Rig(body_R, body_t, boresight=degrees > 0, timed=seconds > 0, known_s=context.camera_offset_s)
+    rig = Rig(
+        body_R, body_t, boresight=degrees > 0, timed=seconds > 0, known_s=context.camera_offset_s, focal=focal > 0
+    )
     readout = readout_s(context.session, context.camera_name, context.camera) if row_time else 0.0
-    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, expected_boresight)
+    return CameraModel(camera, rig, readout, float(np.radians(degrees)), seconds, focal, expected_boresight)
 
 
 def readout_s(session: Session, name: str, camera: Camera | None) -> float:

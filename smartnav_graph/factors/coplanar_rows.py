@@ -6,7 +6,8 @@ Camera poses follow from those of the body at the two keyframes, R_i, p_i and R_
     c0_R_c1 = C^T D C,      c0_t_c1 = C^T (m - l),      l = body_t_cam
 
 with the boresight correction a as a state (A) where asked, and the clock offset d of the camera (T): the images show
-the poses d later, R Exp(w d) and p + v d.
+the poses d later, R Exp(w d) and p + v d. With a focal length that is f longer (I) all coordinates are 1 + f times
+larger. An error of the principal point is a boresight, but for what is far from the axis.
 
 A match is one Sampson residual; its derivatives go by the six components of the relative pose. The normal equations of
 a pair in them have six rows at most, which say the same as all of its matches: A^T A = sum w J^T J. A seventh row
@@ -26,7 +27,7 @@ from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.so3 import exp, log, right_jacobian, rotate, skew
 from smartnav_graph.graph.robust import loss_weights
 from smartnav_graph.graph.update import Measured
-from smartnav_graph.vision.epipolar import Sampson, cross, essential, rays, sampson
+from smartnav_graph.vision.epipolar import Sampson, by_scale, cross, essential, rays, sampson
 from smartnav_graph.vision.pairs import Pairs
 
 # Baselines (m) far below this say nothing: the speed of a hand that holds still, over a second.
@@ -35,13 +36,15 @@ BASELINE_FLOOR_M = 1e-6
 ROUNDING = 1e-12
 # Error of the rotation that all matches of a pair share, in units of that of the direction of the baseline.
 TURN_SHARE = 0.03
+# Power of 1 + f that the focal length multiplies each entry of E by, row by row.
+FOCAL_POWER = np.array([2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 1.0, 0.0])
 # Columns of a row's data: number of the pair, body rate (3) rad/s at both keyframes.
 COLUMNS = 7
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Camera in the body: body_R_cam (3, 3), body_t_cam (3,) m; boresight, timed : which states are estimated;
+    """Camera in the body: body_R_cam (3, 3), body_t_cam (3,) m; boresight, timed, focal : which states are estimated;
     known_s : clock offset that the keyframes at the images have already."""
 
     body_R_cam: Floats
@@ -49,16 +52,18 @@ class Rig:
     boresight: bool = False
     timed: bool = False
     known_s: float = 0.0
+    focal: bool = False
 
     @property
     def letters(self) -> tuple[str, ...]:
         """Kinds of the states that a row touches."""
         clock = ("V", "V", "T") if self.timed else ()
-        return ("X", "X", *clock, *(("A",) if self.boresight else ()))
+        return ("X", "X", *clock, *(("A",) if self.boresight else ()), *(("I",) if self.focal else ()))
 
 
 class Relative(NamedTuple):
-    """c0_R_c1 (m, 3, 3), c0_t_c1 (m, 3), and their derivatives (m, 6, n) [rotation, translation] by state."""
+    """c0_R_c1 (m, 3, 3), c0_t_c1 (m, 3), and their derivatives (m, 6, n) [rotation, translation] by each state but the
+    focal length."""
 
     R: Floats
     t: Floats
@@ -146,11 +151,23 @@ class Matched:
     """Matches of many pairs, of which a row each is made. Data: `COLUMNS`.
 
     sigma : of a match, normalised coordinates; use (n, k) : padded mask of the matches in use, may change until the
-    row is added; loss_scale : of the Cauchy loss, in sigmas
+    row is added; loss_scale : of the Cauchy loss, in sigmas; focal : correction of the focal length that the
+    coordinates have already; shared : sigma (rad) of the direction of a baseline beside the noise of its matches
     """
 
-    def __init__(self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float) -> None:
+    def __init__(
+        self,
+        pairs: Pairs,
+        rig: Rig,
+        sigma: float,
+        use: Mask,
+        loss_scale: float,
+        *,
+        focal: float = 0.0,
+        shared: float = 0.0,
+    ) -> None:
         self.rig, self.sigma, self.use, self.loss_scale, self.there = rig, sigma, use, loss_scale, pairs.there
+        self.focal, self.shared = focal, shared
         self.letters = rig.letters
         x0, x1, shift = pairs.matches
         self.x0, self.x1, self.shift = x0.copy(), x1.copy(), None if shift is None else shift.copy()
@@ -163,47 +180,63 @@ class Matched:
             self.shift = np.zeros((*self.there.shape, 3)) if self.shift is None else self.shift
             self.shift[rows, :width] = shift
 
-    def missed(self, there: Relative, rows: NDArray[np.intp]) -> Sampson:
-        """How far all matches of rows (m,) of pairs miss."""
-        shift = None if self.shift is None else self.shift[rows]
-        return sampson(there.R, there.t, self.x0[rows], self.x1[rows], BASELINE_FLOOR_M, shift)
+    def longer(self, states: Sequence[Floats]) -> Floats:
+        """Correction (m, 1) of the focal length by the states, beside that of the coordinates."""
+        return states[-1] - self.focal if self.rig.focal else np.zeros((len(states[0]), 1))
+
+    def missed(self, there: Relative, rows: NDArray[np.intp], longer: Floats) -> tuple[Sampson, Floats]:
+        """How far all matches of rows (m,) of pairs miss, and the derivative by the focal length."""
+        scale, shift = 1.0 + longer[:, :, None], None if self.shift is None else self.shift[rows]
+        pair = there.R, there.t, self.x0[rows] * scale, self.x1[rows] * scale
+        found = sampson(*pair, BASELINE_FLOOR_M, shift)
+        if not self.rig.focal:
+            return found, np.zeros_like(found.residual)
+        return found, by_scale(*pair, found.residual, BASELINE_FLOOR_M, shift) / scale[:, :, 0]
 
     def measured(self, states: Sequence[Floats], data: Floats) -> Measured:
         """The matches of the rows one by one; see `whole_graph.StackedFactors.measured`."""
         rows = data[:, 0].astype(np.intp)
-        found = self.missed(relative(self.rig, states, data), rows)
+        found, _ = self.missed(relative(self.rig, states, data), rows, self.longer(states))
         white = (found.residual / self.sigma)[self.there[rows]]
         weight = loss_weights(white**2, "cauchy", self.loss_scale)[0]
         return Measured(np.nonzero(self.there[rows])[0], white[:, None], weight, self.use[rows][self.there[rows]])
 
 
 class PairRows(Matched):
-    """Row model of pairs with every match under a loss of its own."""
+    """Row model of pairs with every match under a loss of its own. Beside a shared error they are whitened anew wherever
+    a row is linearised."""
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         rows = data[:, 0].astype(np.intp)
         there = relative(self.rig, states, data)
-        found = self.missed(there, rows)
+        found, by_focal = self.missed(there, rows, self.longer(states))
         white = found.residual / self.sigma
         weight, cost = loss_weights(white**2, "cauchy", self.loss_scale)
         weight, cost = weight * self.use[rows], cost * self.use[rows]
-        by = np.concatenate([found.by_rotation, found.by_translation], axis=-1) / self.sigma
+        focal = [by_focal[..., None]] if self.rig.focal else []
+        by = np.concatenate([found.by_rotation, found.by_translation, *focal], axis=-1) / self.sigma
         weighted = (by * weight[..., None]).transpose(0, 2, 1)
         root, residual = _condensed(weighted @ by, (weighted @ white[..., None])[..., 0], 2.0 * cost.sum(axis=1))
-        return residual, [root @ jacobian for jacobian in there.by]
+        if self.shared > 0.0:
+            size = np.sqrt((there.t**2).sum(axis=1) + BASELINE_FLOOR_M**2)[:, None]
+            to_direction = np.concatenate([np.ones((len(size), 3)), np.repeat(size, 3, axis=1)], axis=1)
+            whitening = _whitening(root[:, :, :6] * to_direction[:, None, :], there.t / size, self.shared)
+            root, residual = whitening @ root, rotate(whitening, residual)
+        return residual, [root[:, :, :6] @ jacobian for jacobian in there.by] + ([root[:, :, 6:]] if focal else [])
 
 
 def _condensed(normal: Floats, right: Floats, square: Floats) -> tuple[Floats, Floats]:
-    """Seven rows equivalent to normal equations (m, 6, 6) with right side (m, 6) and a sum of squares (m,)."""
+    """n + 1 rows equivalent to normal equations (m, n, n) with right side (m, n) and a sum of squares (m,)."""
     values, vectors = np.linalg.eigh(normal)
+    n = normal.shape[1]
     kept = values > ROUNDING * np.maximum(values[:, -1:], 1e-300)
     scale = np.sqrt(np.where(kept, values, 0.0))
-    root = np.zeros((len(normal), 7, 6))
-    root[:, :6] = scale[:, :, None] * vectors.transpose(0, 2, 1)
-    residual = np.zeros((len(normal), 7))
+    root = np.zeros((len(normal), n + 1, n))
+    root[:, :n] = scale[:, :, None] * vectors.transpose(0, 2, 1)
+    residual = np.zeros((len(normal), n + 1))
     seen = (vectors.transpose(0, 2, 1) @ right[:, :, None])[:, :, 0]
-    residual[:, :6] = np.where(kept, seen / np.where(kept, scale, 1.0), 0.0)
-    residual[:, 6] = np.sqrt(np.maximum(square - (residual**2).sum(axis=1), 0.0))
+    residual[:, :n] = np.where(kept, seen / np.where(kept, scale, 1.0), 0.0)
+    residual[:, n] = np.sqrt(np.maximum(square - (residual**2).sum(axis=1), 0.0))
     return root, residual
 
 
@@ -217,14 +250,23 @@ class CompressedRows(Matched):
     other. Where the matches have shifts d of their own in the baseline, the constant x0~^T [d]x R x1~ of each, R where
     it was compressed, is a tenth column beside vec(E).
 
-    shared : sigma (rad) of the direction of a baseline beside the noise of its matches. With one the rows are linear in
-    rotation and direction from where they were compressed: entries of E are not, over degrees of a stiff pair.
+    The focal length multiplies the entries of E by 1, 1 + f or (1 + f)^2. Beside a shared error the rows are linear in
+    rotation, direction and f from where they were compressed: entries of E are not, over degrees of a stiff pair.
     """
 
     def __init__(
-        self, pairs: Pairs, rig: Rig, sigma: float, use: Mask, loss_scale: float, frozen: Relative, shared: float = 0.0
+        self,
+        pairs: Pairs,
+        rig: Rig,
+        sigma: float,
+        use: Mask,
+        loss_scale: float,
+        frozen: Relative,
+        *,
+        focal: float = 0.0,
+        shared: float = 0.0,
     ) -> None:
-        super().__init__(pairs, rig, sigma, use, loss_scale)
+        super().__init__(pairs, rig, sigma, use, loss_scale, focal=focal, shared=shared)
         a, b = rays(self.x0), rays(self.x1)
         E = essential(frozen.R, frozen.t)
         l0, l1 = b @ E.transpose(0, 2, 1), a @ E
@@ -240,21 +282,24 @@ class CompressedRows(Matched):
         total = np.maximum((square * weight).sum(axis=1), 1e-300)
         self.length = _lengths(a, b, weight) / total[:, None, None]
         self.floor = BASELINE_FLOOR_M**2 * weight.sum(axis=1) / total
-        self._shared: _Linear | None = None
+        self._linear: _Linear | None = None
         if shared > 0.0:
-            self._shared = self._with_shared_error(shared, frozen)
+            self._linear = self._with_shared_error(shared, frozen)
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         rows = data[:, 0].astype(np.intp)
-        there = relative(self.rig, states, data)
-        r, by = self._missed(rows, there)
-        return r, [by @ jacobian for jacobian in there.by]
+        there, longer = relative(self.rig, states, data), self.longer(states)
+        r, by, by_focal = self._missed(rows, there, longer)
+        return r, [by @ jacobian for jacobian in there.by] + ([by_focal] if self.rig.focal else [])
 
-    def _missed(self, rows: NDArray[np.intp], there: Relative) -> tuple[Floats, Floats]:
-        """Residuals (m, 9) of some pairs, and their derivatives (m, 9, 6) by the relative pose."""
-        if self._shared is not None:
-            return self._shared.missed(rows, there)
+    def _missed(self, rows: NDArray[np.intp], there: Relative, longer: Floats) -> tuple[Floats, Floats, Floats]:
+        """Residuals (m, 9) of some pairs, and their derivatives (m, 9, 6) by the relative pose, (m, 9, 1) by f."""
+        if self._linear is not None:
+            return self._linear.missed(rows, there, longer)
         e, by_e = _vectorised(there.R, there.t)
+        scale = (1.0 + longer) ** FOCAL_POWER
+        by_longer = (FOCAL_POWER * scale / (1.0 + longer) * e)[:, :, None]
+        e, by_e = scale * e, scale[:, :, None] * by_e
         N, root = self.length[rows], self.root[rows]
         Ne = rotate(N, e)
         square = (e * Ne).sum(axis=1) + self.floor[rows]  # nothing where no match is in use
@@ -262,42 +307,51 @@ class CompressedRows(Matched):
         at_e, constant = root[:, :, :9], root[:, :, 9:].sum(axis=2)
         r = (rotate(at_e, e) + constant) / (self.sigma * s)
         by = at_e / (self.sigma * s[:, :, None]) - r[:, :, None] * (Ne / s**2)[:, None, :]
-        return r, by @ by_e
+        return r, by @ by_e, by @ by_longer
 
     def _with_shared_error(self, sigma: float, frozen: Relative) -> _Linear:
         """The rows whitened beside an error that all matches of a pair share: of the direction of the baseline, `sigma`
-        rad, and of the rotation, a share of it. With A the derivatives by rotation and unit direction u,
-
-            Q = diag(s_R^2 1, sigma^2 (1 - u u^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
-        """
-        r, A = self._missed(np.arange(len(self.root)), frozen)
+        rad, and of the rotation, a share of it; see `_whitening`."""
+        r, A, f = self._missed(np.arange(len(self.root)), frozen, np.zeros((len(self.root), 1)))
         size = np.maximum(np.linalg.norm(frozen.t, axis=1), BASELINE_FLOOR_M)[:, None]
         A[:, :, 3:] *= size[:, :, None]
         u = frozen.t / size
-        Q = np.zeros((len(u), 6, 6))
-        Q[:, :3, :3] = (TURN_SHARE * sigma) ** 2 * np.eye(3)
-        Q[:, 3:, 3:] = sigma**2 * (np.eye(3) - u[:, :, None] * u[:, None, :])
-        white = np.linalg.inv(np.linalg.cholesky(np.eye(9) + A @ Q @ A.transpose(0, 2, 1)))
-        return _Linear(rotate(white, r), white @ A, frozen.R, u)
+        whitening = _whitening(A, u, sigma)
+        return _Linear(rotate(whitening, r), whitening @ A, whitening @ f, frozen.R, u)
+
+
+def _whitening(A: Floats, u: Floats, sigma: float) -> Floats:
+    """L^-1 (n, k, k) of rows with derivatives A (n, k, 6) by rotation and unit direction u (n, 3), beside errors of both
+    that all matches of a pair share, `sigma` rad of the direction:
+
+        Q = diag(s_R^2 1, sigma^2 (1 - u u^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
+    """
+    Q = np.zeros((len(u), 6, 6))
+    Q[:, :3, :3] = (TURN_SHARE * sigma) ** 2 * np.eye(3)
+    Q[:, 3:, 3:] = sigma**2 * (np.eye(3) - u[:, :, None] * u[:, None, :])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(np.eye(A.shape[1]) + A @ Q @ A.transpose(0, 2, 1))))
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """Rows r + A [log(R0^T R), t / |t| - u0] of pairs: r (n, 9), A (n, 9, 6), R0 (n, 3, 3), u0 (n, 3)."""
+    """Rows r + A [log(R0^T R), t / |t| - u0] + f (longer) of pairs: r (n, 9), A (n, 9, 6), f (n, 9, 1), R0 (n, 3, 3),
+    u0 (n, 3)."""
 
     r: Floats
     A: Floats
+    f: Floats
     R: Floats
     u: Floats
 
-    def missed(self, rows: NDArray[np.intp], there: Relative) -> tuple[Floats, Floats]:
+    def missed(self, rows: NDArray[np.intp], there: Relative, longer: Floats) -> tuple[Floats, Floats, Floats]:
         """As `CompressedRows._missed`."""
         size = np.sqrt((there.t**2).sum(axis=1) + BASELINE_FLOOR_M**2)[:, None]
         u, turn = there.t / size, log(self.R[rows].transpose(0, 2, 1) @ there.R)
         A, by = self.A[rows], np.zeros((len(rows), 6, 6))
         by[:, :3, :3] = np.linalg.inv(right_jacobian(turn))
         by[:, 3:, 3:] = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, :, None]
-        return self.r[rows] + rotate(A, np.concatenate([turn, u - self.u[rows]], axis=1)), A @ by
+        r = self.r[rows] + rotate(A, np.concatenate([turn, u - self.u[rows]], axis=1)) + rotate(self.f[rows], longer)
+        return r, A @ by, self.f[rows]
 
 
 def _lengths(a: Floats, b: Floats, weight: Floats) -> Floats:

@@ -48,6 +48,8 @@ OPEN_SHARE, LEAST_OPEN = 0.5, 0.5
 POSE_DOF = 5
 LEAST_MATCHES = 6  # of a pair
 LOSS_SCALE = 2.0  # of the Cauchy loss of a match, sigmas
+# Sigma (rad) of the direction in a replay, where nothing shows yet what it is.
+CAUSAL_SHARED = float(np.radians(0.4))
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class CoplanarityConfig:
     """enabled : use the matches; rate_hz : of images of tracks at most; spans : images apart that tracks are paired
     at; least_parallax : of a pair (median after the rotation is taken out), in sigmas of a match: noise alone makes
     1.7; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's attitude in the body and of its
-    clock as states (zero: known; none given: that of the calibration); row_time : points are taken at the time when
+    clock as states (zero: known; none given: that of the calibration); focal_sigma : relative, of its focal length
+    likewise; row_time : points are taken at the time when
     the row they lie in was read, where the camera's readout is known."""
 
     enabled: bool = True
@@ -64,6 +67,7 @@ class CoplanarityConfig:
     least_parallax: float = 3.0
     boresight_sigma_deg: float | None = None
     time_offset_sigma: float | None = None
+    focal_sigma: float | None = None
     row_time: bool = True
 
     def __post_init__(self) -> None:
@@ -71,12 +75,15 @@ class CoplanarityConfig:
             found = f"rate_hz = {self.rate_hz}, spans = {self.spans}"
             raise ConfigError("config [image_pairs]", found, "> 0, whole numbers >= 1")
         given = (self.least_parallax, self.boresight_sigma_deg or 0.0, self.time_offset_sigma or 0.0)
+        given += (self.focal_sigma or 0.0,)
         if not min(given) >= 0:
             raise ConfigError("config [image_pairs]", f"{self}", "parallax and sigmas >= 0")
 
     def camera_model(self, context: FactorContext) -> CameraModel:
         """The camera of a session with these options."""
-        return make_camera_model(context, self.boresight_sigma_deg, self.time_offset_sigma, self.row_time)
+        return make_camera_model(
+            context, self.boresight_sigma_deg, self.time_offset_sigma, self.focal_sigma, self.row_time
+        )
 
 
 # Why a pair is not used, in words.
@@ -98,7 +105,8 @@ class PairSelection:
     pairs : as they were in the first row of each image, by the motion found; use (n, k) : matches, padded
     rate (k, 3) rad/s : of the body from the images' keyframe stamps to the clock offset found; motion : of it
     verdict (n,) : what became of each pair, places in `REASONS`; refused : why none is used, in words
-    poses : relative poses of the pairs where their matches were selected
+    poses : relative poses of the pairs where their matches were selected; focal : correction of the focal length there,
+    which the coordinates of the pairs have
     """
 
     pairs: Pairs
@@ -108,6 +116,7 @@ class PairSelection:
     verdict: NDArray[np.intp]
     refused: str = ""
     poses: Relative | None = None
+    focal: float = 0.0
 
 
 @dataclass
@@ -240,15 +249,21 @@ class CoplanarityBuilder(Builder):
         shared = pass_state.noise_scales.get(SHARED, 0.0)
         if pass_state.tests(self.name) == COMPRESSED and selection.poses is not None:
             matched = selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE
-            return CompressedRows(*matched, selection.poses, shared)
-        return PairRows(selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE)
+            return CompressedRows(*matched, selection.poses, focal=selection.focal, shared=shared)
+        shared = CAUSAL_SHARED if pass_state.causal else 0.0
+        return PairRows(
+            selection.pairs, self.rig, sigma, selection.use, LOSS_SCALE, focal=selection.focal, shared=shared
+        )
 
     # --- when rows were seen ---
 
-    def with_motion(self, before: PairSelection, offset_s: float, motion: Motion) -> PairSelection:
-        """A selection with the motion found at the images, and the clock offset of the camera."""
+    def with_motion(self, before: PairSelection, offset_s: float, focal: float, motion: Motion) -> PairSelection:
+        """A selection with the motion found at the images, clock offset and correction of the focal length of the
+        camera."""
         rate = self.rates.mean(self.image_ns, offset_s) - motion.gyro_bias
-        return replace(before, rate=rate, motion=motion, pairs=self._at_once(self.seen, offset_s, rate, motion))
+        seen = replace(self.seen, x0=(1.0 + focal) * self.seen.x0, x1=(1.0 + focal) * self.seen.x1)
+        pairs = self._at_once(seen, offset_s, rate, motion)
+        return replace(before, rate=rate, motion=motion, pairs=pairs, focal=focal)
 
     def _see_now(self, rate: Floats, motion: Motion, image: int, update: GraphUpdate) -> None:
         """Rate and motion at one image of a replay, by prediction."""

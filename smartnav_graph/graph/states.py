@@ -53,6 +53,7 @@ STATES: dict[str, StateKind] = {
         _kind("O", "height offset", "session", [10.0], [1.0]),
         _kind("L", "lever arm", "session", [1.0] * 3, [0.05] * 3),
         _kind("A", "mount rotation", "session", [0.3] * 3, [0.01] * 3),
+        _kind("I", "focal length", "session", [0.1], [0.003]),
         _kind("M", "vehicle mount", "session", [0.3] * 2 + [1.0] * 4 + [0.1] * 2, [0.01] * 2 + [0.1] * 4 + [1e-3] * 2),
         _kind("W", "wheel scale and delay", "session", [0.1, 0.3], [0.005, 0.01]),
         _kind("H", "hard iron", "session", [100.0] * 3, [1.0] * 3),

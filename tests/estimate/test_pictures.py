@@ -16,7 +16,7 @@ from smartnav_graph.simulation.scenarios import simulate
 from smartnav_graph.vision import match_store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "vision"))
-from scenes2d import CAMERA, centred, seen, session_of, texture  # noqa: E402
+from scenes2d import CAMERA, centred, seen, session_of, texture
 
 PLANE = texture(seed=7)
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])

@@ -67,8 +67,10 @@ def test_the_camera_moves_with_its_lever_arm():
 
 
 @pytest.mark.parametrize(
-    ("boresight", "timed", "letters"), [(True, True, "TA"), (False, True, "T"), (False, False, "")]
+    ("boresight", "timed", "focal", "letters"),
+    [(True, True, True, "TAI"), (False, True, False, "T"), (False, False, True, "I"), (False, False, False, "")],
 )
-def test_only_states_that_are_asked_for(boresight, timed, letters):
-    camera_model = CameraModel(CAMERA, Rig(BODY_R_CAM, np.zeros(3), boresight, timed), 0.0, 0.01, 0.02)
+def test_only_states_that_are_asked_for(boresight, timed, focal, letters):
+    rig = Rig(BODY_R_CAM, np.zeros(3), boresight, timed, focal=focal)
+    camera_model = CameraModel(CAMERA, rig, 0.0, 0.01, 0.02, 0.02)
     assert "".join(camera_model.states()) == letters

@@ -33,6 +33,8 @@ def scene(rng, rig=RIG, noise=0.0, counts=(25, 40)):
         states += [rng.normal(0, 1, (2, 3)), rng.normal(0, 1, (2, 3)), np.full((2, 1), 0.02)]
     if rig.boresight:
         states += [np.tile([0.01, -0.02, 0.015], (2, 1))]
+    if rig.focal:
+        states += [np.zeros((2, 1))]
     R, t, _ = relative(rig, states, data)
     x0, x1, pair = [], [], []
     for k, count in enumerate(counts):
@@ -55,6 +57,7 @@ def moved(letter, state, axis, h):
 
 
 RIGS = [RIG, replace(RIG, boresight=True), replace(RIG, timed=True), replace(RIG, boresight=True, timed=True)]
+RIGS.append(replace(RIGS[-1], focal=True))
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -62,7 +65,7 @@ def test_relative_pose_has_exact_derivatives(rng, rig):
     _, states, data = scene(rng, rig)
     R, _, by = relative(rig, states, data)
     h = 1e-6
-    for slot, letter in enumerate(rig.letters):
+    for slot, letter in enumerate(rig.letters[: len(by)]):
         for axis in range(by[slot].shape[2]):
             up, down = (
                 relative(rig, [moved(letter, s, axis, f * h) if i == slot else s for i, s in enumerate(states)], data)
@@ -79,10 +82,62 @@ def test_nothing_is_left_at_the_truth(rng, rig):
     pairs, states, data = scene(rng, rig)
     residual, jacobians = PairRows(pairs, rig, SIGMA, pairs.there, 2.0).linearize(states, data)
     assert np.abs(residual).max() < 1e-7
-    assert all(jacobian[:, 6].any() == 0 for jacobian in jacobians)
+    assert all(jacobian[:, -1].any() == 0 for jacobian in jacobians)
     there = relative(rig, states, data)
     small = CompressedRows(pairs, rig, SIGMA, pairs.there, 1e6, there)
     assert np.abs(small.linearize(states, data)[0]).max() < 1e-3  # sigmas; the root of rounding
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.01])
+@pytest.mark.parametrize("kind", ["pairs", "compressed"])
+def test_derivatives_by_pose_and_focal_length(rng, kind, shared):
+    """At poses near those of the matches and a focal length 3 % longer; matches that fit have a cost of none."""
+    rig = replace(RIG, focal=True)
+    pairs, states, data = scene(rng, rig)
+    there = relative(rig, states, data)
+    model = PairRows(pairs, rig, SIGMA, pairs.there, 1e6, shared=shared)
+    if kind == "compressed":
+        model = CompressedRows(pairs, rig, SIGMA, pairs.there, 1e6, there, shared=shared)
+    off = [states[0], moved("X", states[1], 4, 0.01), np.full((2, 1), 0.01)]
+    square = [(model.linearize(at, data)[0] ** 2).sum(axis=1) for at in (states, off)]
+    assert (square[0] < 1e-5).all() and (square[1] > 1.0).all()
+    if kind == "pairs":  # rows are rotated from state to state: their squares are not
+        gradient = [
+            2 * np.einsum("mi,mij->mj", model.linearize(off, data)[0], J) for J in model.linearize(off, data)[1]
+        ]
+    h = 1e-6
+    for slot, letter in enumerate(rig.letters):
+        for axis in range(model.linearize(off, data)[1][slot].shape[2]):
+            up, down = (
+                model.linearize([moved(letter, s, axis, f * h) if i == slot else s for i, s in enumerate(off)], data)[0]
+                for f in (1, -1)
+            )
+            if kind == "compressed":
+                np.testing.assert_allclose(
+                    model.linearize(off, data)[1][slot][:, :, axis], (up - down) / (2 * h), rtol=1e-4, atol=1e-2
+                )
+            elif shared == 0.0:
+                change = ((up**2).sum(axis=1) - (down**2).sum(axis=1)) / (2 * h)
+                np.testing.assert_allclose(gradient[slot][:, axis], change, rtol=1e-4, atol=1e-1)
+
+
+def test_an_error_of_direction_that_all_matches_share_counts_as_one(rng):
+    """Turned by one sigma of it about the second camera, a pair of many matches costs about one."""
+    pairs, states, data = scene(rng, counts=(400, 400))
+    there, sigma = relative(RIG, states, data), 0.02
+    across = np.cross(there.t, [0.0, 0.0, 1.0])
+    across *= sigma * np.linalg.norm(there.t, axis=1)[:, None] / np.linalg.norm(across, axis=1)[:, None]
+    nav_from_camera = states[0][:, :3, :3] @ RIG.body_R_cam
+    aside = states[1].copy()
+    aside[:, :3, 3] += np.einsum("nij,nj->ni", nav_from_camera, across)
+    for model in (
+        PairRows(pairs, RIG, SIGMA, pairs.there, 1e6, shared=sigma),
+        CompressedRows(pairs, RIG, SIGMA, pairs.there, 1e6, there, shared=sigma),
+    ):
+        cost = (model.linearize([states[0], aside], data)[0] ** 2).sum(axis=1)
+        assert ((cost > 0.5) & (cost < 1.1)).all()
+    stiff = PairRows(pairs, RIG, SIGMA, pairs.there, 1e6).linearize([states[0], aside], data)[0]
+    assert ((stiff**2).sum(axis=1) > 20.0).all()
 
 
 def test_a_wrong_camera_is_seen(rng):

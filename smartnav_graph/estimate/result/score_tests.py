@@ -2,7 +2,7 @@
 how far they may move it (`smoothers.sensitivity`).
 
 Tested one by one are the clock offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of
-accelerometer and gyroscope, and the focal length of the camera; where several sensors measure the position, an offset
+accelerometer and gyroscope, and the focal length of a camera whose calibration has no sigma of it; where several sensors measure the position, an offset
 of each to the others. Errors that a class of devices has, and no state takes, are in the covariance (consider
 covariance): with their prior D, information I and score s by the data,
 
@@ -39,8 +39,8 @@ PARTS, LEAST_FIXES = 10, 6
 LEAST_LEFT = 1e-6
 # Variance of the mean readings of windows over that of their noise, from which a scale factor shows.
 EXCITED = 250.0
-# Factors of image pairs, and a small relative change of the focal length.
-PAIRS, FOCAL_STEP = "image_pairs", 1e-4
+# Factors of image pairs.
+PAIRS = "image_pairs"
 # Errors of a class of devices: scale factors, of each axis by itself and of all axes of a sensor alike (voltage,
 # temperature, clock), and rate by specific force, rad/s / (m/s^2).
 SCALE_SIGMA, COMMON_SCALE_SIGMA = 0.002, 0.006
@@ -205,20 +205,16 @@ def _of_stances(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[
 
 
 def _of_images(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:
-    """Directions by a focal length that is too small are too far from the axis: x (1 + f), y (1 + f) in every match,
-    which is vec(E) with its entries multiplied by 1, 1 + f or (1 + f)^2."""
+    """Of a camera whose focal length is no state."""
     by_pair = {part.name.row: part.row for part in parts if part.name.sensor == PAIRS}
     rows = list[tuple[int, Floats]]()
-    across = np.array([1.0 + FOCAL_STEP, 1.0 + FOCAL_STEP, 1.0])
     for stack in solved.estimate.stacks(PAIRS):
-        if not isinstance(stack.model, CompressedRows):
+        if not isinstance(stack.model, CompressedRows) or stack.model.rig.focal:
             continue
-        moved = copy(stack.model)
-        moved.root = stack.model.root.copy()
-        moved.root[:, :, :9] *= np.outer(across, across).ravel()
-        states = stack.states(solved.estimate.snapshot)
-        change = [model.linearize(states, stack.data)[0] for model in (moved, stack.model)]
-        derivative = (change[0] - change[1]) / FOCAL_STEP
+        model = copy(stack.model)
+        model.rig = replace(model.rig, focal=True)
+        states = [*stack.states(solved.estimate.snapshot), np.zeros((len(stack.data), 1))]
+        derivative = model.linearize(states, stack.data)[1][-1][:, :, 0]
         rows += [(by_pair[row], derivative[k]) for k, row in enumerate(stack.rows.tolist()) if row in by_pair]
     if len(rows) >= LEAST_FIXES:
         yield SensorError(PAIRS, "focal length"), rows

@@ -28,6 +28,7 @@ from smartnav_graph.estimate.reweight.image_pair_outliers import pair_account
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, position_builders
+from smartnav_graph.factors.camera import FOCAL
 from smartnav_graph.factors.coplanarity import SHARED
 from smartnav_graph.factors.imu import ImuBuilder
 from smartnav_graph.graph.update import one_of
@@ -266,10 +267,23 @@ def _images(inputs: VerdictInputs) -> Iterator[Reason]:
         text = f"{100 * share:.0f} % of the image pairs contradict the other sensors{none}"
         remedy = "check clock and calibration of the camera, or add fixes, control points or standstills"
         yield Reason(LEVELS[1], "image_pairs", text, remedy, share)
+    yield from _focal_length(inputs)
     turned = inputs.solved.pass_state.noise_scales.get(SHARED, 0.0)
     if turned:
-        text = f"image pairs and the other sensors agree only to {np.degrees(turned):.1f} deg of the direction of motion"
+        text = (
+            f"image pairs and the other sensors agree only to {np.degrees(turned):.1f} deg of the direction of motion"
+        )
         yield Reason(LEVELS[1], "image_pairs", text, "check clock and calibration of the camera", turned)
+
+
+def _focal_length(inputs: VerdictInputs) -> Iterator[Reason]:
+    """A focal length that is found far from the calibrated one, or further than its sigma allows."""
+    found = next((one for one in inputs.solved.estimate.session.values() if one.name == FOCAL and not one.held), None)
+    if found is None or not inputs.together:
+        return
+    (value,), (sigma,), (prior,), limit = found.value, found.sigma, found.prior_sigma, LIMITS["focal length"]
+    if abs(value) > min(max(limit.size, limit.sigmas * sigma), FAR * prior):
+        yield Reason(LEVELS[1], "image_pairs", limit.text.format(percent=100.0 * value), limit.remedy, float(value))
 
 
 def _biases(inputs: VerdictInputs) -> Iterator[Reason]:

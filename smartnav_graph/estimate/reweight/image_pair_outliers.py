@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
-from smartnav_graph.factors.camera import BORESIGHT, STREAM, CameraModel, Motion
+from smartnav_graph.factors.camera import BORESIGHT, FOCAL, STREAM, CameraModel, Motion
 from smartnav_graph.factors.coplanar_rows import COLUMNS, Relative, relative
 from smartnav_graph.factors.coplanarity import (
     COMPRESSED,
@@ -71,8 +71,8 @@ def check_pairs(builders: Iterable[Builder], estimate: Estimate, pass_state: Pas
     place, _ = estimate.keyframes_at(builder.image_ns, builder.merge_ns)
     R, _, v, bias = (x[place] for x in estimate.states())
     motion = Motion(R, v, bias[:, 3:])
-    offset_s, _ = camera_states(builder.camera_model, estimate)
-    selection = builder.with_motion(builder.selection(pass_state), offset_s, motion)
+    offset_s, _, focal = camera_states(builder.camera_model, estimate)
+    selection = builder.with_motion(builder.selection(pass_state), offset_s, focal, motion)
     poses, inside = relative_poses(builder, selection, estimate)
     if tests == 0:
         use, verdict = builder.by_turn(selection.pairs, poses.R)
@@ -180,7 +180,7 @@ def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estima
     first, second = builder.seen.images.T
     data = np.zeros((len(first), COLUMNS))
     data[:, 1:4], data[:, 4:7] = selection.rate[first], selection.rate[second]
-    states, (offset_s, boresight) = [pose[first], pose[second]], camera_states(builder.camera_model, estimate)
+    states, (offset_s, boresight, _) = [pose[first], pose[second]], camera_states(builder.camera_model, estimate)
     if builder.rig.timed:
         states += [v[first], v[second], np.full((len(first), 1), offset_s + builder.rig.known_s)]
     if builder.rig.boresight:
@@ -188,14 +188,15 @@ def relative_poses(builder: CoplanarityBuilder, selection: PairSelection, estima
     return relative(builder.rig, states, data), known[first] & known[second]
 
 
-def camera_states(camera: CameraModel, estimate: Estimate) -> tuple[float, Floats]:
-    """Clock offset (s) beside the one that the keyframes at the images have, and boresight (3,) rad, by an estimate, as
-    expected where they are not states of it."""
+def camera_states(camera: CameraModel, estimate: Estimate) -> tuple[float, Floats, float]:
+    """Clock offset (s) beside the one that the keyframes at the images have, boresight (3,) rad and correction of the
+    focal length, by an estimate, as expected where they are not states of it."""
     expected = {state.name: state.initial for state in camera.states().values()}
     found = {name: one.value for name, one in estimate.session.items() if name in expected}
-    clock, boresight = ({**expected, **found}.get(name) for name in (f"{STREAM}_time_offset_s", BORESIGHT))
+    names = (f"{STREAM}_time_offset_s", BORESIGHT, FOCAL)
+    clock, boresight, focal = ({**expected, **found}.get(name) for name in names)
     offset_s = 0.0 if clock is None else float(clock[0]) - camera.rig.known_s
-    return offset_s, np.zeros(3) if boresight is None else boresight
+    return offset_s, np.zeros(3) if boresight is None else boresight, 0.0 if focal is None else float(focal[0])
 
 
 def _refusal(verdict: NDArray[np.intp]) -> str:

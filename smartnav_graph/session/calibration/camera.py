@@ -32,6 +32,7 @@ class Camera:
     noise_px : sigma of an inlier match, px per axis; time_offset_s : a frame stamped t shows IMU time t + offset;
     readout_s : from the first row to the last, 0 for a global shutter
     boresight_sigma_deg, time_offset_sigma_s : sigmas of its attitude in the body and of its clock
+    focal_sigma : of its focal length, relative
     body_R : row-major (3, 3), its axes, body_t : (3,) m, its place in the body where they were calibrated; else the
     session's mount has them
     """
@@ -49,6 +50,7 @@ class Camera:
     readout_s: float = 0.0
     boresight_sigma_deg: float = 0.5
     time_offset_sigma_s: float = 0.02
+    focal_sigma: float = 0.02
     body_R: tuple[float, ...] = ()
     body_t: tuple[float, ...] = ()
 
@@ -66,7 +68,7 @@ class Camera:
         for name in ("width", "height", "fx", "fy", "noise_px"):
             if not 0 < getattr(self, name) <= LARGEST_PX:
                 raise self._error(f"{name} = {getattr(self, name)}", f"0 to {LARGEST_PX} px", "give pixels")
-        for name in ("readout_s", "boresight_sigma_deg", "time_offset_sigma_s"):
+        for name in ("readout_s", "boresight_sigma_deg", "time_offset_sigma_s", "focal_sigma"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise self._error(f"{name} = {getattr(self, name)}", "a finite number >= 0")
         if self.body_R and not (len(self.body_R) == 9 and is_rotation(np.reshape(self.body_R, (3, 3)))):
