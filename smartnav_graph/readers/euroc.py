@@ -29,7 +29,7 @@ from smartnav_graph.session.session import Device, Mount, Session
 GRAVITY = 9.81
 # The cameras are triggered by the clock of the IMU, and were calibrated with it to hundredths of a degree (Furgale et
 # al. 2013, Kalibr): images of a flight determine their attitude less well.
-calibrated = partial(Camera, boresight_sigma_deg=0.03, time_offset_sigma_s=0.002, focal_sigma=0.002)
+calibrated = partial(Camera, boresight_sigma_deg=0.03, time_offset_sigma_s=0.002, focal_sigma=0.0)
 GROUND_TRUTH = (Path("state_groundtruth_estimate0", "data.csv"), Path("mocap0", "data.csv"), Path("gt", "data.csv"))
 CAMERA_CHAIN = (Path("dso", "camchain.yaml"), Path("camchain.yaml"), Path("calibration", "camchain.yaml"))
 

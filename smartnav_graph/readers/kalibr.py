@@ -46,7 +46,7 @@ def kalibr_cameras(path: Path | None, names: list[str]) -> tuple[dict[str, Mount
                 time_offset_s=shift,
                 boresight_sigma_deg=0.1,
                 time_offset_sigma_s=0.002,
-                focal_sigma=0.002,
+                focal_sigma=0.0,
             )
         except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
             expected = "T_cam_imu, intrinsics (4), resolution (2), distortion_model radtan or equidistant"

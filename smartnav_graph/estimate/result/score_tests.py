@@ -2,9 +2,9 @@
 how far they may move it (`smoothers.sensitivity`).
 
 Tested one by one are the clock offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of
-accelerometer and gyroscope, and the focal length of a camera whose calibration has no sigma of it; where several sensors measure the position, an offset
-of each to the others. Errors that a class of devices has, and no state takes, are in the covariance (consider
-covariance): with their prior D, information I and score s by the data,
+accelerometer and gyroscope, and the focal length of a camera that has no state for it; where several sensors measure
+the position, an offset of each to the others. Errors that a class of devices has, and no state takes, are in the
+covariance (consider covariance): with their prior D, information I and score s by the data,
 
     m = C s      C = (I + D^-1)^-1      P <- P + S (C + m m^T) S^T
 
