@@ -203,8 +203,8 @@ class Matched:
 
 
 class PairRows(Matched):
-    """Row model of pairs with every match under a loss of its own. Beside a shared error they are whitened anew wherever
-    a row is linearised."""
+    """Row model of pairs with every match under a loss of its own. Beside a shared error rows are whitened anew where
+    they are linearised."""
 
     def linearize(self, states: Sequence[Floats], data: Floats) -> tuple[Floats, list[Floats]]:
         rows = data[:, 0].astype(np.intp)
@@ -321,8 +321,8 @@ class CompressedRows(Matched):
 
 
 def _whitening(A: Floats, u: Floats, sigma: float) -> Floats:
-    """L^-1 (n, k, k) of rows with derivatives A (n, k, 6) by rotation and unit direction u (n, 3), beside errors of both
-    that all matches of a pair share, `sigma` rad of the direction:
+    """L^-1 (n, k, k) of rows with derivatives A (n, k, 6) by rotation and unit direction u (n, 3), beside errors of
+    both that all matches of a pair share, `sigma` rad of the direction:
 
         Q = diag(s_R^2 1, sigma^2 (1 - u u^T)),   1 + A Q A^T = L L^T,   rows <- L^-1 rows
     """

@@ -74,9 +74,8 @@ class CoplanarityConfig:
         if not (self.rate_hz > 0 and self.spans and min(self.spans) >= 1):
             found = f"rate_hz = {self.rate_hz}, spans = {self.spans}"
             raise ConfigError("config [image_pairs]", found, "> 0, whole numbers >= 1")
-        given = (self.least_parallax, self.boresight_sigma_deg or 0.0, self.time_offset_sigma or 0.0)
-        given += (self.focal_sigma or 0.0,)
-        if not min(given) >= 0:
+        sigmas = (self.boresight_sigma_deg, self.time_offset_sigma, self.focal_sigma)
+        if not min(self.least_parallax, *(sigma or 0.0 for sigma in sigmas)) >= 0:
             raise ConfigError("config [image_pairs]", f"{self}", "parallax and sigmas >= 0")
 
     def camera_model(self, context: FactorContext) -> CameraModel:

@@ -123,8 +123,9 @@ class Corridors:
 
     It starts at the origin facing north: the mean of the initial state after a standstill without other measurements.
     Each word of `turns` is the way to the next stop of `stop_s`: a letter per crossing, with a turn of 90 deg to the
-    left (L) or right (R) within `turn_s`. The first of three crossings is taken in an arc, at `corner_m_s`; at the
-    others it halts, is turned on the spot and halts again, each time for `halt_s`. Speeds change within `ramp_s`.
+    left (L) or right (R) within `turn_s`. The first of `arc_every` crossings is taken in an arc, at `corner_m_s` (zero:
+    none is); at the others it halts, is turned on the spot and halts again, each time for `halt_s`. Speeds change
+    within `ramp_s`.
     A trolley held by a person is not exactly at rest: `fidget_m_s` and the slow `creep_m_s`, `creep_rad_s` are the
     remaining speeds per axis, root mean square.
     """
@@ -141,6 +142,7 @@ class Corridors:
     halt_s: float = 0.8
     speed_m_s: float = 1.0
     corner_m_s: float = 0.6
+    arc_every: int = 3
     fidget_m_s: float = 4e-4
     creep_m_s: float = 1.5e-4
     creep_rad_s: float = 3.5e-5
@@ -159,7 +161,7 @@ class Corridors:
         halt, speed, done = Leg(self.halt_s, 0.0), 0.0, 0.0
         for count, letter in enumerate(word):
             turn_deg = 90.0 if letter == "L" else -90.0
-            if count % 3 == 0:
+            if self.arc_every and count % self.arc_every == 0:
                 yield from self._drive(self.spacing_m - done - self._arc_m, speed, self.corner_m_s)
                 yield Leg(self.turn_s, self.corner_m_s, turn_deg)
                 speed, done = self.corner_m_s, self._arc_m

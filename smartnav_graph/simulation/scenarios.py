@@ -5,7 +5,8 @@ With a camera: room-30s (tracks), rendered-room-10s (pictures) and trolley-20min
 position measurements. That is also the initial state of a run without fixes, in batch and replay, so that errors are
 those of the whole way. The trolley rests for three minutes and stops ten times for ten seconds; at two corners of three
 it halts for 0.8 s before and after it is turned, too briefly to be detected, so that the listed halts fix its velocity
-and not its heading; round the third it is pushed in an arc. Without standstills: ``--standstill.zupt False
+and not its heading; round the third it is pushed in an arc. trolley-20min-plain has turns on the spot alone, at longer
+corridors, and matches of neighbours only. Without standstills: ``--standstill.zupt False
 --standstill.zaru False``. A wrong boresight or camera clock, unknown to the session: ``replace(scenario,
 camera=replace(scenario.camera, boresight_deg=(0.0, 0.5, 0.0), clock_s=0.02))``.
 """
@@ -23,7 +24,7 @@ from smartnav_graph.simulation import motions, thesis
 from smartnav_graph.simulation.cameras import ON_PHONE, PHONE_CAMERA, Faults, PictureModel, SimulatedCamera
 from smartnav_graph.simulation.fixes import GnssModel, PoseFixModel, RangeModel
 from smartnav_graph.simulation.recording import Scenario
-from smartnav_graph.simulation.scenes import FurnishedRoom
+from smartnav_graph.simulation.scenes import CorridorGrid, FurnishedRoom
 from smartnav_graph.simulation.sensors import BarometerModel, MagnetometerModel, SpeedModel
 from smartnav_graph.simulation.trajectory import Trajectory
 
@@ -81,6 +82,21 @@ _ROOM = SimulatedCamera(
     faults=Faults(lost=0.01),
 )
 _RENDERED = replace(_ROOM, tracked=False, pictures=PictureModel())
+_PLAIN = motions.Corridors(
+    turns=("LRL", "RRL", "LLL", "RRL", "LLL", "RRR", "RLL", "LLR", "LRR", "LRR"),
+    spacing_m=16.8,
+    turn_s=4.0,
+    arc_every=0,
+    fidget_m_s=5e-4,
+    creep_m_s=0.0,
+    creep_rad_s=0.0,
+)
+_PLAIN_CAMERA = replace(
+    thesis.CORRIDOR_CAMERA,
+    scene=CorridorGrid(nodes=(4, 6), origin=(3, 0), spacing_m=_PLAIN.spacing_m, per_m2=20.0),
+    range_m=(0.3, 15.0),
+    pairs=(1,),
+)
 SCENARIOS: dict[str, Scenario] = {
     s.name: s
     for s in (
@@ -124,6 +140,14 @@ SCENARIOS: dict[str, Scenario] = {
             thesis.TROLLEY,
             profile="galaxy-s2-warming",
             camera=thesis.CORRIDOR_CAMERA,
+            rest_sigma_m_s=5e-4,
+        ),
+        Scenario(
+            "trolley-20min-plain",
+            1200.0,
+            _PLAIN,
+            profile="galaxy-s2-warming",
+            camera=_PLAIN_CAMERA,
             rest_sigma_m_s=5e-4,
         ),
         *thesis.SCENARIOS,

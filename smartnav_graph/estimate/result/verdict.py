@@ -271,7 +271,7 @@ def _images(inputs: VerdictInputs) -> Iterator[Reason]:
     turned = inputs.solved.pass_state.noise_scales.get(SHARED, 0.0)
     if turned:
         text = (
-            f"image pairs and the other sensors agree only to {np.degrees(turned):.1f} deg of the direction of motion"
+            f"image pairs and the other sensors agree on the direction of motion to {np.degrees(turned):.1f} deg"
         )
         yield Reason(LEVELS[1], "image_pairs", text, "check clock and calibration of the camera", turned)
 
