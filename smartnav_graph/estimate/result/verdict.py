@@ -267,12 +267,13 @@ def _images(inputs: VerdictInputs) -> Iterator[Reason]:
         text = f"{100 * share:.0f} % of the image pairs contradict the other sensors{none}"
         remedy = "check clock and calibration of the camera, or add fixes, control points or standstills"
         yield Reason(LEVELS[1], "image_pairs", text, remedy, share)
-    yield from _focal_length(inputs)
+
+
+def _direction(inputs: VerdictInputs) -> Iterator[Reason]:
+    """Image pairs that count for less than their matches say."""
     turned = inputs.solved.pass_state.noise_scales.get(SHARED, 0.0)
     if turned:
-        text = (
-            f"image pairs and the other sensors agree on the direction of motion to {np.degrees(turned):.1f} deg"
-        )
+        text = f"image pairs and the other sensors agree on the direction of motion to {np.degrees(turned):.1f} deg"
         yield Reason(LEVELS[1], "image_pairs", text, "check clock and calibration of the camera", turned)
 
 
@@ -389,7 +390,7 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
 # What names a cause comes before what it makes of the solution.
 TESTS: tuple[Test, ...] = (
     *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _lasting, _images),
-    *(_biases, _alike, _two_places, _predictions, _left_out, _solver),
+    *(_focal_length, _direction, _biases, _alike, _two_places, _predictions, _left_out, _solver),
 )
 # What compares positions with inertial data says nothing of a motion model.
 POSITIONS_ONLY: tuple[Test, ...] = (_recording, _misfits, _rejected, _alike, _solver)

@@ -34,6 +34,8 @@ CONTRARY, RARE = 1.1, 1e-3
 # First and largest sigma of the direction, rad, and the least and most that it grows by in a pass.
 FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(5.0))
 STEP = (1.6, 3.0)
+# Share of a misfit that is left where a larger error of the direction is its cure, and its name among the selections.
+LEFT, LAST_MISFIT = 0.5, "misfit_of_the_last_pass"
 # Mean square of the change of positions by images over what it has by their gain of information, from which it is none:
 # changes are alike for long. Least share of the variance that counts as a gain.
 CHANGED, LEAST_GAIN = 2.0, 0.1
@@ -45,15 +47,19 @@ def weigh_images(builders: Iterable[Builder], estimate: Estimate, pass_state: Pa
     pairs = one_of(builders, CoplanarityBuilder)
     if pairs is None or pass_state.tests(pairs.name) < COMPRESSED or pairs.selection(pass_state).refused:
         return pass_state
-    before = pass_state.noise_scales.get(SHARED, 0.0)
+    before, last = pass_state.noise_scales.get(SHARED, 0.0), pass_state.selections.get(LAST_MISFIT)
     contrary, rare = (CONTRARY, RARE) if before == 0.0 else (1.0, 0.5)
-    worst = max(_misfit(builders, estimate, rare), _change(estimate, pass_state))
+    misfit, change = _misfit(builders, estimate, rare), _change(estimate, pass_state)
+    if isinstance(last, float) and misfit - 1.0 > LEFT * (last - 1.0):  # not the images
+        misfit = 1.0
+    worst = max(misfit, change)
     if worst <= contrary:
         return pass_state
     if before >= LARGEST:
-        return _refused(pairs, pass_state)
+        return _refused(pairs, pass_state) if change > CONTRARY else pass_state
     wanted = FIRST if before == 0.0 else min(before * float(np.clip(np.sqrt(worst), *STEP)), LARGEST)
-    pass_state = replace(pass_state, noise_scales={**pass_state.noise_scales, SHARED: wanted})
+    scales, selections = {**pass_state.noise_scales, SHARED: wanted}, {**pass_state.selections, LAST_MISFIT: misfit}
+    pass_state = replace(pass_state, noise_scales=scales, selections=selections)
     return _counted_once(pairs, pass_state) if before == 0.0 else pass_state
 
 
