@@ -135,7 +135,7 @@ def calibrate(session: Session, notes: Notes) -> Session:
 
 
 def choose_sensors(session: Session, notes: Notes) -> Session:
-    """Only the named sensors, or all but those with a leading minus; the inertial data always stay. `images` stands for
+    """Only the named sensors, or all but those with a leading minus; the inertial data always stay. `images` means
     all that they gave: matches, tracks, and the pose fixes of a model."""
     chosen = notes.config.run.sensors
     if not chosen:
