@@ -26,9 +26,14 @@ class Evaluate(Reporting):
     """
 
     run_path: RunPath
-    """Run folder."""
+    """Run folder, or a trajectory of another program as for --reference."""
     reference: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """TUM, EuRoC ground truth, KITTI poses, CSV with t, x, y, z named, or a session folder."""
+    """TUM, EuRoC ground truth, KITTI poses, CSV with t, x, y, z named, a session, a EuRoC or KITTI folder, a ROS bag
+    (BAG#/topic)."""
+    report_path: Annotated[Path | None, tyro.conf.arg(name="report", metavar="FILE")] = None
+    """Also write the figures and plots as a page (.html)."""
+    force: Switch = False
+    """Replace the page."""
     times: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Times of KITTI poses."""
     body_T_ref: Annotated[Path | None, tyro.conf.arg(name="body-T-ref", metavar="FILE")] = None
@@ -42,24 +47,43 @@ class Evaluate(Reporting):
 
     def run(self) -> None:
         from smartnav_graph.evaluation import evaluate
-        from smartnav_graph.output.run_folder import read_run
-        from smartnav_graph.readers.reference import load_reference
+        from smartnav_graph.evaluation.trajectories import as_solution
+        from smartnav_graph.output.report.comparison import write_comparison_report
+        from smartnav_graph.output.run_folder import SUMMARY, read_run
+        from smartnav_graph.readers.reference import load_reference, load_trajectory
 
         offset = _offset(self.time_offset)
+        if self.report_path is not None:
+            refuse_existing(self.report_path, self.force)
         with progress(self.quiet) as show:
             show(f"reading {self.reference}", 0, 0)
             reference = load_reference(self.reference, times=self.times, body_T_ref=self.body_T_ref)
-            solution = read_run(self.run_path).named(self.solution)
+            run = None if self._is_trajectory(SUMMARY) else read_run(self.run_path)
+            if run is None:
+                track = load_trajectory(self.run_path, times=self.times, body_T_ref=self.body_T_ref)
+                solution, reference = as_solution(track, reference, str(self.run_path))
+            else:
+                solution = run.named(self.solution)
             show("comparing", 0, 0)
             found = evaluate(
                 solution,
                 reference,
                 align=self.align,
                 time_offset_s=offset,
-                solution_name=self.solution,
+                solution_name=self.solution if run is not None else str(self.run_path),
                 reference_name=str(self.reference),
             )
-        self.report(found.to_dict(), evaluation_text(found))
+            if self.report_path is not None:
+                summary = {} if run is None else run.summary
+                write_comparison_report(self.report_path, self.run_path.name, solution, reference, found, summary)
+        page = "" if self.report_path is None else f"\nreport: {self.report_path}"
+        self.report(found.to_dict(), evaluation_text(found) + page)
+
+    def _is_trajectory(self, summary: str) -> bool:
+        """Whether the estimate is of another program."""
+        from smartnav_graph.readers.robotics.ros_poses import is_bag
+
+        return not (self.run_path / summary).is_file() and (self.run_path.is_file() or is_bag(self.run_path))
 
 
 def _offset(text: str) -> float | Literal["auto"]:

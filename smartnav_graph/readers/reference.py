@@ -6,6 +6,8 @@ EuRoC               comma separated, heading #time...: ns, p, q (w first)[, v[, 
 KITTI poses         12 numbers a row (camera 0 in its first frame); needs `times` and `body_T_ref`
 CSV                 a heading that names time, x, y, z (or e_m, n_m, u_m) and, if there, qw, qx, qy, qz
 session             a folder with reference.parquet, or that file
+log                 a folder or archive of a known format with ground truth: EuRoC, TUM-VI, KITTI, ...
+ROS bag             Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Path; BAG#/topic
 ==================  ===============================================================================================
 """
 
@@ -20,6 +22,7 @@ from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.files import read_table, read_toml
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS
+from smartnav_graph.readers.robotics.ros_poses import is_bag, pose_columns_of_bag
 from smartnav_graph.readers.source import vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
 from smartnav_graph.session.folder import build_stream
@@ -62,7 +65,11 @@ def load_reference(
         `times` or `body_T_ref` is missing where needed, or given where it does not apply.
     """
     path = Path(path)
-    if path.is_dir() or path.suffix == ".parquet":
+    if is_bag(path):
+        file, columns = path, pose_columns_of_bag(path)
+    elif _is_log(path):
+        file, columns = path, _of_log(path)
+    elif path.is_dir() or path.suffix == ".parquet":
         file = path / "reference.parquet" if path.is_dir() else path
         columns = read_table(file)
     else:
@@ -74,6 +81,35 @@ def load_reference(
         raise ConfigError("--times", f"is given, but {file} has times of its own", "KITTI poses", "leave it out")
     _check_unit(file, columns)
     return _built(file, columns if body_T_ref is None else _of_body(file, columns, load_transform(body_T_ref)))
+
+
+def load_trajectory(
+    path: str | Path, *, times: str | Path | None = None, body_T_ref: str | Path | None = None
+) -> Reference:
+    """A trajectory of another program, to be compared: as `load_reference`, where `times` and `body_T_ref` count for
+    KITTI poses only."""
+    lines = first_lines(Path(path)) if Path(path).is_file() and not is_bag(path) else []
+    is_kitti = bool(lines) and _is_numbers(lines[0], 12)
+    return load_reference(path, times=times, body_T_ref=body_T_ref) if is_kitti else load_reference(path)
+
+
+def _is_log(path: Path) -> bool:
+    """Whether it is the folder of a log of another program."""
+    from smartnav_graph.readers import READERS
+
+    ours = any((path / name).is_file() for name in ("reference.parquet", "session.toml"))
+    return path.is_dir() and not ours and any(reader.matches(str(path)) for reader in READERS.values())
+
+
+def _of_log(path: Path) -> Table:
+    """The ground truth of a log."""
+    from smartnav_graph import readers
+
+    found = readers.load(path).reference
+    if found is None:
+        rule = "a log with ground truth, such as a EuRoC or KITTI folder"
+        raise SessionError(path, "holds no reference trajectory", rule, "give the file of the trajectory itself")
+    return found.columns()
 
 
 def _columns(path: Path, lines: list[str]) -> Table:

@@ -138,6 +138,23 @@ def test_export_and_evaluation_of_the_export_is_zero(call, tmp_path):
         assert (tmp_path / f"run.{name}").stat().st_size > 1000
 
 
+def test_a_trajectory_of_another_program_is_evaluated_like_a_run(call, tmp_path):
+    """By its positions alone where it has no attitude; the page has the figures, and is replaced by force only."""
+    assert call(f"export run --format tum --out {tmp_path}/run.tum")[0] == 0
+    rows = [line.split()[:4] for line in (tmp_path / "run.tum").read_text().splitlines()]
+    (tmp_path / "p.csv").write_text("t,x,y,z\n" + "".join(f"{','.join(row)}\n" for row in rows))
+    page = f"--report {tmp_path}/page.html"
+    run = json.loads(call("evaluate run --reference eight --json")[1])
+    for name in ("run.tum", "p.csv"):
+        found = json.loads(call(f"evaluate {tmp_path}/{name} --reference eight --json {page} --force")[1])
+        assert found["ape_m"]["rmse"] == pytest.approx(run["ape_m"]["rmse"], abs=0.1)  # m, between 1 Hz epochs
+        assert (found["rotation_deg"] is None) == (name == "p.csv") and found["nees"]["position"] is None
+        text = (tmp_path / "page.html").read_text()
+        assert f"{name} against eight" in text and "East error" in text and "nan" not in text.split("<script")[0]
+    code, _, err = call(f"evaluate run --reference eight {page}")
+    assert code == 1 and "page.html: exists already" in err
+
+
 def test_export_of_pictures_with_their_place(call, workshop, tmp_path):
     from PIL import Image
 

@@ -252,3 +252,17 @@ def test_options_that_say_nothing_are_refused(tmp_path):
 def test_transform_faults(tmp_path, text, part):
     with pytest.raises(SessionError, match=part):
         load_transform(write(tmp_path, text, "t.toml"))
+
+
+def test_ground_truth_of_a_euroc_folder_is_the_reference(tmp_path):
+    (tmp_path / "mav0/imu0").mkdir(parents=True)
+    rows = "".join(f"{i * 5_000_000},0,0,0.1,9.81,0,0\n" for i in range(200))
+    (tmp_path / "mav0/imu0/data.csv").write_text("#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z\n" + rows)
+    with pytest.raises(SessionError, match="holds no reference trajectory"):
+        load_reference(tmp_path)
+    (tmp_path / "mav0/state_groundtruth_estimate0").mkdir()
+    truth = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n5000000,1,2,3,1,0,0,0\n10000000,1.5,2,3,1,0,0,0\n"
+    (tmp_path / "mav0/state_groundtruth_estimate0/data.csv").write_text(truth)
+    found = load_reference(tmp_path)
+    np.testing.assert_array_equal(found.enu, [[1, 2, 3], [1.5, 2, 3]])
+    np.testing.assert_array_equal(found.t_ns, [5_000_000, 10_000_000])

@@ -90,6 +90,19 @@ def draw(
     return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
 
 
+def two_paths(estimate: Floats, seconds: Floats, reference: Floats) -> str:
+    """An estimated path (n, 3) with its times s, and a reference (m, 3), as a figure."""
+    x, y, aspect = _axes(np.concatenate([estimate[:, :2], reference[:, :2]]))
+    plot = Plot(x, y, "Map of both trajectories", "North [m]", "East [m]", aspect=aspect)
+    if len(reference) > 1:
+        _path(plot, reference[:, :2], "line reference")
+    _path(plot, estimate[:, :2], "line path", seconds)
+    _scale_and_north(plot)
+    widest = f"max-width:min(100%,calc(680px*{aspect:.3f} + 70px))"
+    entries = [("line path", "Estimate, aligned"), ("line reference", "Reference")]
+    return f'<figure class="map" style="{widest}">{legend(entries)}{plot.render()}</figure>'
+
+
 def _near(path: Floats, fixes: Mapping[str, tuple[Floats, NDArray[np.str_]]]) -> Floats:
     """Fixes that enlarge the map: at most by a fifth of the size of the path."""
     lo, hi = path.min(axis=0), path.max(axis=0)
