@@ -39,10 +39,24 @@ def test_smoothing_needs_neither_pictures_nor_viewer_nor_tables():
     assert not {"cv2", "pycolmap", "rerun", "pandas", "matplotlib"} & there
 
 
-def test_help_is_as_light():
-    for command in ("[", "['smooth', ", "['match', ", "['import', "):
-        code = f"from smartnav_graph.cli import main\nmain({command}'--help'])"
-        assert not {"gtsam", "cv2", "pycolmap", "rerun", "scipy", "pandas"} & loaded_after(code)
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("--help", "smooth --help", "match --help", "import --help", "formats", "formats --columns"),
+        *("calibrate --help", "calibrate camera --help", "calibrate static --help", "calibrate axes --help"),
+    ],
+)
+def test_help_and_lists_load_little(command):
+    code = f"from smartnav_graph.cli import main\nmain({command.split()})"
+    assert not {"gtsam", "cv2", "pycolmap", "rerun", "scipy", "pandas", "matplotlib"} & loaded_after(code)
+
+
+@pytest.mark.parametrize("command", ["smooth --help-all", "config", "config --dump"])
+def test_the_configuration_is_shown_without_the_libraries_that_compute(command):
+    code = f"from smartnav_graph.cli import main\nmain({command.split()})"
+    there = loaded_after(code)
+    assert "gtsam" in there  # in which the options of the factors are declared
+    assert not {"cv2", "pycolmap", "rerun", "scipy", "pandas", "matplotlib"} & there
 
 
 def test_every_promised_name_is_there():

@@ -74,5 +74,5 @@ _ = found.plot()
 #
 # ## A factor of your own
 #
-# Measurements that the package does not know are added from a package of your own, without a change here: see the page
-# on factors and readers of other packages under [How to](../how-to/index.md).
+# Measurements that the package does not know are added from a package of your own, without a change here: see
+# [Write a factor or a reader of your own](../how-to/own-factor.md).

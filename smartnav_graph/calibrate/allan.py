@@ -11,8 +11,8 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from scipy import stats
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Indices
 
 BLOCK = 1 << 15  # differences at a time: they stay in the cache of the processor
@@ -63,5 +63,5 @@ def confidence_limits(deviation: Floats, sizes: Indices, count: int, level: floa
     flicker = np.where(m == 1, 2 * n**2 / (2.3 * n + 4.9), 5 * n**2 / (4 * m * (n + 3 * m)))
     walk = n / m * ((n - 1) ** 2 - 3 * m * (n - 1) + 4 * m**2) / (n - 2) ** 2
     freedom = np.maximum(np.select([slope < -0.25, slope < 0.25], [white, flicker], walk), 1.0)
-    low, high = stats.chi2.ppf([[0.5 + level / 2], [0.5 - level / 2]], freedom)
+    low, high = chi_square.ppf([[0.5 + level / 2], [0.5 - level / 2]], freedom)
     return deviation * np.sqrt(freedom / low), deviation * np.sqrt(freedom / high)

@@ -22,13 +22,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import optimize, signal, stats
 
 from smartnav_graph.calibrate.least_squares import derivatives_of
 from smartnav_graph.calibrate.rests import check_readings, find_rests, interval_s
 from smartnav_graph.calibrate.result import CalibrationResult
 from smartnav_graph.calibrate.static import one_session
-from smartnav_graph.core import so3
+from smartnav_graph.core import chi_square, so3
 from smartnav_graph.core.arrays import Floats, Indices, Times
 from smartnav_graph.core.clustered import clustered_covariance
 from smartnav_graph.core.errors import CalibrationError, ConfigError
@@ -137,6 +136,8 @@ def _means(t: Floats, readings: Floats, edges: Floats) -> Floats:
 
 def _first_lag(one: Floats, two: Floats, step: float) -> float:
     """Seconds that the reference started before the device, by the correlation of the lengths of their rates."""
+    from scipy import signal
+
     a, b = one - one.mean(), two - two.mean()
     overlap = signal.correlate(np.ones(len(b)), np.ones(len(a)), method="fft")
     power = signal.correlate(b**2, np.ones(len(a)), method="fft") * signal.correlate(
@@ -209,7 +210,7 @@ def _linear(
     freedom = max(left.size - J.shape[2] + 3 * (not bias), 1)
     variance = max(float((left**2).sum()) / freedom, 1e-16)
     if block is None:
-        wider = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
+        wider = float(chi_square.student_ratio(freedom))
         return solved, np.asarray(variance * wider**2 * np.linalg.inv(normal)), left
     groups = [np.flatnonzero(block == i) for i in np.unique(block)]
     information = np.array([np.einsum("nip,niq->pq", J[rows], J[rows]) for rows in groups])
@@ -219,6 +220,8 @@ def _linear(
 
 def nearest_permutation(matrix: Floats) -> Floats:
     """The signed permutation P (3, 3) of the largest entries of a matrix (3, 3)."""
+    from scipy import optimize
+
     rows, columns = optimize.linear_sum_assignment(-np.abs(matrix))
     found = np.zeros((3, 3))
     found[rows, columns] = np.where(matrix[rows, columns] < 0, -1.0, 1.0)

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
@@ -164,6 +163,7 @@ def _resized(gray: Gray, scale: float) -> Gray:
 def refined(gray: Gray, xy: Floats, window_px: int = 0, share: float = WINDOW) -> Floats:
     """Corners (n, 2) px where the edges around them meet, in a window of `share` of their distance."""
     import cv2
+    from scipy.spatial import cKDTree
 
     if window_px == 0:
         nearest = float(cKDTree(xy).query(xy, 2)[0][:, 1].min())

@@ -21,7 +21,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.clustered import clustered_covariance
@@ -345,6 +344,8 @@ def check_count(views: Sequence[BoardView]) -> None:
 
 def check_orientations(views: Sequence[BoardView], poses: Floats) -> None:
     """Refuse views that are alike, or in which the board has one orientation only."""
+    from scipy.spatial.transform import Rotation
+
     R = exp(poses[:, :3])
     distinct: list[int] = []
     for i in range(len(poses)):

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, stats
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 
 NOISE_PASSES = 6
@@ -47,6 +47,8 @@ def adjust(
 
     prior (p,) : sigmas, inf for none; least_noise : of residuals, in their unit; loss : of scipy.optimize
     """
+    from scipy import optimize
+
     tied = np.isfinite(prior)
     noise, p = max(float(np.std(residuals(nominal))), least_noise), nominal
     freedom, jacobian, left, count = 1.0, np.zeros((0, len(p))), np.zeros(0), 0
@@ -64,7 +66,7 @@ def adjust(
         noise = max(float(np.sqrt(np.sum(left**2) / freedom)), least_noise)
         if abs(noise / scale - 1) < 1e-3:
             break
-    wider = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
+    wider = float(chi_square.student_ratio(freedom))
     inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian))
     return Adjusted(p, inverse * wider**2, left, noise, freedom, -inverse @ jacobian[:count].T / noise)
 

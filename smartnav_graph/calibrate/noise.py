@@ -17,8 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import dct
-from scipy.optimize import nnls
 
 from smartnav_graph.core.arrays import Floats, Indices
 
@@ -87,6 +85,8 @@ def spectrum_of(readings: Floats, dt: float, leverage: Floats | None = None) -> 
 
     leverage : (n,) of the coefficients, where the readings are residuals: the share of each that a regression took
     """
+    from scipy.fft import dct
+
     squares = dct(readings, norm="ortho")[1:] ** 2
     edges = bin_edges(len(readings))
     count = np.diff(edges).astype(np.float64)
@@ -151,6 +151,8 @@ def _in_band(part: Spectrum, band_hz: float) -> NoiseModel:
 def _maximum(part: Spectrum) -> tuple[Floats, Floats]:
     """Squared coefficients (c,) >= 0 of maximum likelihood, and their covariance (c, c), by Fisher scoring: repeated
     non-negative least squares with the weights of the model before."""
+    from scipy.optimize import nnls
+
     scale = np.median(part.power[:, None] / part.shapes, axis=0)
     shapes = part.shapes * scale
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from smartnav_graph.calibrate.interior import CameraFit, project_board
 from smartnav_graph.core.arrays import Floats, Mask
@@ -94,6 +93,8 @@ def projection_difference(
     CalibrationError
         The images have other sizes.
     """
+    from scipy.optimize import least_squares
+
     if (one.width, one.height) != (other.width, other.height):
         found = f"{one.width} x {one.height} and {other.width} x {other.height} px"
         raise CalibrationError("calibrate compare", found, "one size of image", "scale or crop one of them before")

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
-from scipy.fft import dct
 
 from smartnav_graph.calibrate.noise import NoiseModel, fit_noise, shapes_of, spectrum_of
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 
 LEAST_FREEDOM = 2.0  # degrees of freedom of a variance
@@ -41,6 +40,8 @@ class Regression:
 
 def regress(readings: Sequence[Floats], regressors: Sequence[Floats], dt: float) -> Regression:
     """Regression of stretches of readings (n_i,) on regressors (n_i, p), each stretch with its own mean."""
+    from scipy.fft import dct
+
     centres = np.array([x.mean(axis=0) for x in regressors])
     centred = [x - centre for x, centre in zip(regressors, centres, strict=True)]
     normal = np.linalg.pinv(sum((x.T @ x for x in centred), np.zeros((centres.shape[1],) * 2)))
@@ -74,7 +75,7 @@ def _covariance(weights: list[Floats], noise: NoiseModel, dt: float) -> Floats:
     own = np.einsum("tpp->tp", parts)
     variance = np.maximum(np.diag(covariance), 1e-300)
     freedom = np.maximum(2 * variance**2 / np.einsum("tp,tu,up->p", own, noise.covariance, own), LEAST_FREEDOM)
-    wider = stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)
+    wider = chi_square.student_ratio(freedom)
     return np.asarray(covariance * np.outer(wider, wider))
 
 

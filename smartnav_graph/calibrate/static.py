@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import dct
 
 from smartnav_graph.calibrate.allan import allan_deviation, cluster_sizes, confidence_limits
 from smartnav_graph.calibrate.noise import TERMS
@@ -156,6 +155,8 @@ def _record(
     axis: AxisAtRest, name: str, by_temperature: bool, seconds: float, values: dict[str, Value], refused: dict[str, str]
 ) -> None:
     """Values and refusals of one axis."""
+    from scipy.fft import dct
+
     sensor, letter = name.split("_")
     unit, *term_units = UNITS[sensor]
     found, noise = axis.found, axis.found.noise

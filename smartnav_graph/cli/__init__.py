@@ -42,9 +42,10 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "intervals": ("intervals", "Intervals", "drift between fixes (simulated outages)"),
     "calibrate": ("calibrate", "Calibrate", "calibrate sensors, camera, clocks; show, compare, apply"),
     "config": ("config", "ConfigCommand", "show the configuration, as the text of a config.toml"),
-    "explain": ("inspection", "Explain", "explain which measurements determine the state of a run at one epoch"),
+    "explain": ("inspection", "Explain", "explain which measurements determine the state at one epoch"),
     "compare": ("inspection", "Compare", "compare a run with another run"),
     "export": ("runs", "Export", "export a run: TUM, KML, GPX, CSV, SBET, NMEA, GeoPackage, images ..."),
+    "completion": ("completion", "Completion", "print the script of bash, zsh or fish that completes commands"),
     "view": ("sessions", "View", "show sessions and runs in the Rerun viewer"),
 }
 
@@ -52,7 +53,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 def overview() -> str:
     """The text of ``smartnav --help``."""
     lines = ["usage: smartnav COMMAND ... [--quiet] [--debug]", "", "commands:"]
-    lines += [f"  {name:<10}{summary}" for name, (_, _, summary) in COMMANDS.items()]
+    lines += [f"  {name:<11}{summary}" for name, (_, _, summary) in COMMANDS.items()]
     lines += ["", "`smartnav COMMAND --help` shows the options and an example.", "Begin with: smartnav demo"]
     return "\n".join(lines)
 
@@ -68,6 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     The exit code.
     """
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks
+        from smartnav_graph.cli.completion import answer
+
+        answer()
     try:
         code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
@@ -125,7 +130,7 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
     from smartnav_graph.core.files import remove_unfinished, written
 
     written.clear()
-    with interrupts.raising() as received:
+    with interrupts.raising() as received, _plain_warnings("--quiet" in rest):
         try:
             kind, name, rest = kind.narrowed(name, rest)
             if asked := {"-h", "--help", "--help-all"} & set(rest):
@@ -135,8 +140,7 @@ def _carry_out(kind: type[Command], name: str, rest: list[str]) -> int:
             handler = logging.StreamHandler()
             handler.setFormatter(_Inert("%(message)s"))
             logging.basicConfig(level=logging.ERROR if command.quiet else logging.WARNING, handlers=[handler])
-            with _plain_warnings(command.quiet):
-                return command.run() or 0
+            return command.run() or 0
         except (SmartnavError, BrokenPipeError, SystemExit):
             raise
         except Exception as error:

@@ -28,6 +28,20 @@ class Calibrate(Command):
     Example: smartnav calibrate camera pictures --out calibration.toml --report report.html
     """
 
+    PLACE: ClassVar[str] = "KIND ..."
+
+    @classmethod
+    def kinds(cls) -> dict[str, str]:
+        """The kinds and the other sub-commands, with a line about each."""
+        others = {
+            "apply": "correct the inertial data of a session by a calibration, or keep the calibration with it",
+            "show": "show a calibration.toml",
+            "compare": "differences of two calibrations, over their sigmas, of cameras also in pixels",
+            "board": "write a calibration board as a PDF",
+            "undistort": "write the pictures of a folder without distortion",
+        }
+        return {name: kind.summary for name, kind in KINDS.items()} | others
+
     @classmethod
     def narrowed(cls, name: str, arguments: list[str]) -> tuple[type[Command], str, list[str]]:
         """The command of a kind, or `show`, `compare`, `apply`."""
@@ -39,28 +53,16 @@ class Calibrate(Command):
         if word in commands:
             return commands[word], f"{name} {word}", arguments[1:]
         if word not in KINDS:
-            raise ConfigError(
-                f"calibrate {word}", "is no kind of calibration", f"one of {', '.join([*KINDS, *commands])}"
-            )
+            raise ConfigError(f"calibrate {word}", "is no kind of calibration", f"one of {', '.join(cls.kinds())}")
         row = KINDS[word]
         options = row.options_class()
         about = f"{(options.__doc__ or row.summary).strip()}\n\nExample: {row.example}"
         return with_options(Calibrating, options, about, KIND=word), f"{name} {word}", arguments[1:]
 
 
-def _help() -> str:
-    lines = [f"{name:<14}{kind.summary}" for name, kind in KINDS.items()]
-    lines += [
-        f"{'apply':<14}correct the inertial data of a session by a calibration, or keep the calibration with it",
-        f"{'show':<14}show a calibration.toml",
-        f"{'compare':<14}differences of two calibrations, over their sigmas, of cameras also in pixels",
-        f"{'board':<14}write a calibration board as a PDF",
-        f"{'undistort':<14}write the pictures of a folder without distortion",
-    ]
-    return "\n\nKinds:\n\n" + "\n\n".join(lines)
-
-
-Calibrate.__doc__ = (Calibrate.__doc__ or "") + _help()
+_LISTED = "\n\n".join(f"{name:<16}{summary}" for name, summary in Calibrate.kinds().items())
+_HEADING = "\n\nKinds (`smartnav calibrate KIND --help` has the options of one):\n\n"
+Calibrate.__doc__ = (Calibrate.__doc__ or "") + _HEADING + _LISTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +74,7 @@ class Calibrating(Command):
     sources: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SESSION")]
     """Session folders, or logs of a known format; images or a folder of them for a camera."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("calibration.toml")
-    """calibration.toml; what is found is added to an existing file."""
+    """The calibration.toml; what is found is added to an existing file."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write an HTML report with plots."""
     force: Switch = False
@@ -101,7 +103,7 @@ class Show(Reporting):
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """calibration.toml."""
+    """A calibration.toml."""
 
     def run(self) -> None:
         known = load_calibration(self.file)
@@ -116,10 +118,10 @@ class CompareCalibrations(Reporting):
     Example: smartnav calibrate compare may.toml october.toml
     """
 
-    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """calibration.toml."""
-    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """Another one."""
+    first: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE1")]
+    """A calibration.toml."""
+    second: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE2")]
+    """Another calibration.toml."""
 
     def run(self) -> None:
         one, two = load_calibration(self.first), load_calibration(self.second)
@@ -146,7 +148,7 @@ class Apply(Writing):
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """calibration.toml."""
+    """A calibration.toml."""
     session: SourceName
     """Session folder, or a log of a known format."""
     correct: Switch = False

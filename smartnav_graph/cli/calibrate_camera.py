@@ -40,7 +40,7 @@ class PrintBoard(Command):
     """
 
     board: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="BOARD")]
-    """chessboard:9x6:0.025, circles:4x11:0.02 or charuco:8x6:0.03:0.021, as for `smartnav calibrate camera`."""
+    """As chessboard:9x6:0.025, circles:4x11:0.02 or charuco:8x6:0.03:0.021, as for `smartnav calibrate camera`."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("board.pdf")
     """The PDF."""
     force: Switch = False
@@ -64,7 +64,7 @@ class Undistort(Command):
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folder of pictures."""
     calibration: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("calibration.toml")
-    """calibration.toml with the camera."""
+    """A calibration.toml with the camera."""
     camera: str = "cam0"
     """Name of the camera."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("undistorted")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import tyro
 
@@ -17,11 +17,6 @@ if TYPE_CHECKING:  # what computes is imported when a command runs: its help is 
 
     from smartnav_graph.estimate.config import Config
 
-# Fields of the configuration that have an option of their own.
-OWN_OPTIONS = {
-    "run": ("vehicle", "sensors", "withhold", "start_s", "end_s", "initial", "rate"),
-    "vehicle": ("enabled",),
-}
 Made = TypeVar("Made", bound="DataclassInstance")
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 Text = str | None
@@ -40,10 +35,18 @@ class Command:
     debug: Switch = False
     """Show the traceback of an error."""
 
+    # What stands in the place of arguments in the line of usage, where there are none.
+    PLACE: ClassVar[str] = ""
+
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Self | None:
         """Defaults that depend on the arguments; None for those of the class."""
         return None
+
+    @classmethod
+    def kinds(cls) -> dict[str, str]:
+        """Sub-commands with a line about each, where there are any."""
+        return {}
 
     @classmethod
     def narrowed(cls, name: str, arguments: list[str]) -> tuple[type[Command], str, list[str]]:
@@ -83,8 +86,14 @@ class Writing(Command):
 class Configured(Command):
     """A command with the options of the configuration."""
 
+    # Fields of the configuration that have an option of their own.
+    OWN_OPTIONS: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "run": ("vehicle", "sensors", "withhold", "start_s", "end_s", "initial", "rate"),
+        "vehicle": ("enabled",),
+    }
+
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """config.toml; options override it."""
+    """A config.toml; options override it."""
     options: object = None
 
     @classmethod
@@ -95,8 +104,8 @@ class Configured(Command):
         sections = []
         for section in dataclasses.fields(Config):
             kind = cast("type[DataclassInstance]", section.default_factory)
-            kept = [f for f in dataclasses.fields(kind) if f.name not in OWN_OPTIONS.get(section.name, ())]
-            if section.name in OWN_OPTIONS:
+            kept = [f for f in dataclasses.fields(kind) if f.name not in cls.OWN_OPTIONS.get(section.name, ())]
+            if section.name in cls.OWN_OPTIONS:
                 rows = [(f.name, f.type, field(default=f.default)) for f in kept]
                 kind = dataclasses.make_dataclass(kind.__name__, rows, frozen=True, namespace={"__doc__": kind.__doc__})
             sections.append((section.name, kind, field(default_factory=kind)))

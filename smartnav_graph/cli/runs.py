@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -45,6 +46,11 @@ class Replay(Estimating):
 
     Example: smartnav replay kitti --out kitti-replay --smoother fixed-lag --lag 10
     """
+
+    OWN_OPTIONS: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        **Estimating.OWN_OPTIONS,
+        "replay": ("smoother", "lag_s"),
+    }
 
     smoother: Literal["fixed-lag", "isam2"] | None = None
     """The smoother."""

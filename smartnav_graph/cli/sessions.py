@@ -29,14 +29,14 @@ class Formats(Command):
     """Print the page about the session folder instead: streams, columns, units, keys of session.toml."""
 
     def run(self) -> None:
-        from smartnav_graph.readers import READERS
+        from smartnav_graph.readers import known_readers
         from smartnav_graph.session.format_page import format_page
 
         if self.columns:
             print(format_page(), end="")
             return
 
-        for reader in READERS.values():
+        for reader in known_readers().values():
             print(f"{reader.name:<18}{reader.summary}\n{'':<18}recognised by {reader.recognised_by}")
 
 

@@ -6,11 +6,23 @@ Least-squares estimation of transformation parameters between two point patterns
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import seconds_since
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+def _rotations() -> type[Rotation]:
+    """The class of scipy, whose module takes 0.2 s to load: help and lists do without."""
+    from scipy.spatial import transform
+
+    found: type[Rotation] = transform.Rotation
+    return found
 
 
 def skew(v: Floats) -> Floats:
@@ -22,17 +34,17 @@ def skew(v: Floats) -> Floats:
 
 def exp(w: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) rad."""
-    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape(*w.shape, 3)
+    return np.asarray(_rotations().from_rotvec(w.reshape(-1, 3)).as_matrix()).reshape(*w.shape, 3)
 
 
 def log(R: Floats) -> Floats:
     """Rotation vectors (..., 3) rad, not longer than pi, of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
+    return np.asarray(_rotations().from_matrix(R.reshape(-1, 3, 3)).as_rotvec()).reshape(R.shape[:-1])
 
 
 def chained(turns: Floats) -> Rotation:
     """Products Exp(turns[0]) ... Exp(turns[k]), each k (n,), of rotation vectors (n, 3) rad."""
-    q = Rotation.from_rotvec(turns).as_quat().T.copy()
+    q = _rotations().from_rotvec(turns).as_quat().T.copy()
     count = 1
     while count < q.shape[1]:  # each holds the product of `count` turns
         (a, b, c, d), (x, y, z, w) = q[:, :-count], q[:, count:]
@@ -45,7 +57,7 @@ def chained(turns: Floats) -> Rotation:
             ]
         )
         count *= 2
-    return Rotation.from_quat(q.T)
+    return _rotations().from_quat(q.T)
 
 
 def rotate(R: Floats, v: Floats) -> Floats:
@@ -60,12 +72,12 @@ def rotate_back(R: Floats, v: Floats) -> Floats:
 
 def quaternion(R: Floats) -> Floats:
     """Unit quaternions (m, 4) w x y z, w >= 0, of rotation matrices (m, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True)[:, [3, 0, 1, 2]])
+    return np.asarray(_rotations().from_matrix(R).as_quat(canonical=True)[:, [3, 0, 1, 2]])
 
 
 def from_quaternion(q: Floats) -> Floats:
     """Rotation matrices (m, 3, 3) of quaternions (m, 4) w x y z of any norm but zero."""
-    return np.asarray(Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix())
+    return np.asarray(_rotations().from_quat(q[:, [1, 2, 3, 0]]).as_matrix())
 
 
 def slerp(t_ns: Times, at_ns: Times, R: Floats) -> Floats:
@@ -75,9 +87,12 @@ def slerp(t_ns: Times, at_ns: Times, R: Floats) -> Floats:
     """
     if len(R) == 1:
         return np.repeat(R, len(t_ns), axis=0)
+    from scipy.spatial.transform import Slerp
+
     inside = np.clip(t_ns, at_ns[0], at_ns[-1])
     t0 = int(at_ns[0])
-    return np.asarray(Slerp(seconds_since(at_ns, t0), Rotation.from_matrix(R))(seconds_since(inside, t0)).as_matrix())
+    turn = Slerp(seconds_since(at_ns, t0), _rotations().from_matrix(R))
+    return np.asarray(turn(seconds_since(inside, t0)).as_matrix())
 
 
 def left_jacobian_inverse(theta: Floats) -> Floats:

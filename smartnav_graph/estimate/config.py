@@ -14,7 +14,7 @@ from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.files import read_toml
 from smartnav_graph.core.tables import structured
 from smartnav_graph.estimate.alignment.initial_state import InitialiseConfig
-from smartnav_graph.factors import FACTORS
+from smartnav_graph.factors import FACTORS, add_installed_factors
 from smartnav_graph.graph.keyframes import KeyframeConfig
 from smartnav_graph.session.session import VEHICLES
 from smartnav_graph.smoothers.batch import BatchConfig
@@ -128,6 +128,7 @@ class GeneralConfig:
     report: ReportConfig = field(default_factory=ReportConfig)
 
 
+add_installed_factors()
 _OF_FACTORS = {factor.section: factor.config for factor in FACTORS.values()}
 FactorConfigs: Any = dataclasses.make_dataclass(
     "FactorConfigs",

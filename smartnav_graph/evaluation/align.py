@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
@@ -207,6 +206,8 @@ def find_time_offset(solution: Solution, reference: Reference, method: str) -> f
     SessionError
         No candidate: the speeds do not vary and the spans do not overlap.
     """
+    from scipy.optimize import minimize_scalar
+
     estimate, truth = states_of_solution(solution), states_of_reference(reference, 0)
     periods = [float(np.median(np.diff(track.t_ns))) / NS for track in (estimate, truth) if len(track) > 1]
     step_s = float(np.clip(max(periods, default=0.1), 0.05, 1.0))

@@ -18,9 +18,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
-from smartnav_graph.core import figures
+from smartnav_graph.core import chi_square, figures
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.so3 import log, rotate_back
@@ -323,7 +322,7 @@ def nees_verdict(average: float, errors: Floats, covariances: Floats) -> str:
     correlation = correlation / np.maximum(correlation[0], 1e-300)
     positive = np.logical_and.accumulate(correlation > 0.0, axis=0)
     independent = float((n / np.maximum(2.0 * (correlation * positive).sum(axis=0) - 1.0, 1.0)).sum())
-    low, high = chi2.ppf([0.025, 0.975], independent) / independent
+    low, high = chi_square.ppf([0.025, 0.975], independent) / independent
     ratio = average / k
     if low <= ratio <= high:
         return "sigmas right"

@@ -1,7 +1,8 @@
 """Factors: one file a kind, with its options (`Config`), its model and its builder.
 
 A new factor adds a file here and a row in `FACTORS`; the options of a run, the report and the recording are made from
-it. A new sensor also adds a stream to `session.streams`.
+it. A new sensor also adds a stream to `session.streams`. Other packages add factors by entry points of the group
+``smartnav_graph.builders``; see docs/how-to/own-factor.md.
 
 A default sigma has one home: noise of a device or of what carries it in `session.calibration.model` (calibration.toml),
 sigma of a model assumption or of a prior in the module of its factor, in its `Config` where a user may set it.
@@ -10,8 +11,10 @@ sigma of a model assumption or of a prior in the module of its factor, in its `C
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 
+from smartnav_graph.core.errors import InputTypeError, warn
+from smartnav_graph.core.plugins import installed_parts
 from smartnav_graph.factors import (
     barometer,
     control,
@@ -57,6 +60,12 @@ class Factor:
     stream: str | None = None
     parts: Mapping[str, Label] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not (isinstance(self.config, type) and is_dataclass(self.config)):
+            raise InputTypeError("Factor.config", f"is {self.config!r}", "a dataclass", "decorate it with @dataclass")
+        if not isinstance(self.label, Label):
+            raise InputTypeError("Factor.label", f"is {self.label!r}", "a Label", "give Label('Title of the factor')")
+
 
 def _of(stream: str, build: Build, config: type[object], section: str = "", **parts: Label) -> Factor:
     """The factor that goes by the name of its stream, as its section does where none is given."""
@@ -64,7 +73,7 @@ def _of(stream: str, build: Build, config: type[object], section: str = "", **pa
 
 
 # The inertial builder comes first: it predicts the state that the others refer to.
-FACTORS: Mapping[str, Factor] = {
+FACTORS: dict[str, Factor] = {
     "prior": Factor(
         *(None, prior.PriorConfig, "prior"),
         Label("Initial state", assumes="prior on the initial state", colour=(150, 150, 150)),
@@ -127,6 +136,18 @@ _LABELS = {
     **{name: factor.label for name, factor in FACTORS.items()},
     **{name: label for factor in FACTORS.values() for name, label in factor.parts.items()},
 }
+
+
+def add_installed_factors() -> None:
+    """Add the factors of other installed packages to `FACTORS`: once, before the configuration is made of them."""
+    for name, factor in installed_parts("smartnav_graph.builders", Factor, {*FACTORS, *_LABELS}).items():
+        same = [one.config for one in FACTORS.values() if one.section == factor.section]
+        if same and factor.config not in same:
+            warn(f"factor {name}: section {factor.section!r} has other options; left out; choose another section")
+            continue
+        FACTORS[name] = factor
+        _PARTS.update(dict.fromkeys(factor.parts, name))
+        _LABELS.update({name: factor.label, **factor.parts})
 
 
 def label_of(name: str) -> Label:

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.timebase import NS
@@ -44,7 +44,8 @@ UNKNOWN_HEIGHT = 1000.0  # m, of a local frame over the pressure at its start
 @dataclass(frozen=True)
 class BarometerConfig:
     """reference_hpa : the day's pressure at sea level, where it is known (else the first samples set the height);
-    reference_sigma : m, of heights from it: the geoid undulates by so much; loss : ``huber`` (short peaks) or ``none``.
+    reference_sigma : sigma of heights from it, m (the geoid undulates by so much); loss : ``huber`` (short peaks) or
+    ``none``.
     """
 
     reference_hpa: float | None = None
@@ -178,7 +179,7 @@ def scatter_hpa(stream: Barometer, noise: BarometerNoise) -> float:
     together = np.diff(second[first], n=2) == 0
     if together.sum() < LEAST_MEANS:
         return 0.0
-    found = float(np.median(np.abs(np.diff(means, n=2)[together])) / (norm.ppf(0.75) * np.sqrt(6.0)))
+    found = float(np.median(np.abs(np.diff(means, n=2)[together])) / (chi_square.normal_ppf(0.75) * np.sqrt(6.0)))
     return found if found > CLEARLY_MORE * noise.pressure_sigma / np.sqrt(np.median(counts)) else 0.0
 
 

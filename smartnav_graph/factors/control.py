@@ -12,7 +12,7 @@ from smartnav_graph.session.calibration.model import GnssNoise
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """lever_arm_sigma : m, prior of the lever arm as a state (zero: taken as known)."""
+    """lever_arm_sigma : prior of the lever arm as a state, m (zero: taken as known)."""
 
     lever_arm_sigma: float = 0.0
 

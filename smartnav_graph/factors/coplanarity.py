@@ -54,12 +54,14 @@ CAUSAL_SHARED = float(np.radians(0.4))
 
 @dataclass(frozen=True)
 class CoplanarityConfig:
-    """enabled : use the matches; rate_hz : of images of tracks at most; spans : images apart that tracks are paired
-    at; least_parallax : of a pair (median after the rotation is taken out), in sigmas of a match: noise alone makes
-    1.7; boresight_sigma_deg, time_offset_sigma : deg and s, priors of the camera's attitude in the body and of its
-    clock as states (zero: known; none given: that of the calibration); focal_sigma : relative, of its focal length
-    likewise; row_time : points are taken at the time when
-    the row they lie in was read, where the camera's readout is known."""
+    """enabled : use the matches; rate_hz : most images of tracks per second; spans : images apart that tracks are
+    paired at; least_parallax : parallax of a pair (median after the rotation is taken out), in sigmas: noise
+    alone makes 1.7; boresight_sigma_deg : prior of the camera's attitude in the body as a state (zero: known;
+    none given: that of the calibration); time_offset_sigma : prior of the camera's clock offset as a state, s
+    (zero: known; none given: that of the calibration); focal_sigma : prior of its focal length as a state, a ratio
+    (likewise); row_time : points are taken at the time when the row they
+    lie in was read, where the camera's readout is known.
+    """
 
     enabled: bool = True
     rate_hz: float = 4.0

@@ -29,7 +29,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import NS, Gap, seconds_since
@@ -147,6 +146,8 @@ class FittedModel:
     def noise(self, seen: Floats) -> tuple[Floats, Floats]:
         """White density (6,) and diffusion (6, 6) of the stretches with the most similar features: a turn is harder to
         predict than a straight."""
+        from scipy.optimize import nnls
+
         apart = np.linalg.norm(self.seen - seen, axis=2)
         count = max(LEAST, round(ALIKE * len(apart)))
         alike = np.argsort(apart, axis=0, kind="stable")[:count]

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Mask
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.frames import STANDARD_GRAVITY
@@ -44,10 +44,11 @@ LEAST_WEIGHT = 1e-4  # below it a row is left out
 class GnssConfig:
     """loss : ``gate`` (Cauchy to find outliers, chi-square gate with re-admission, then least squares), ``gnc``
     (truncated least squares by graduated non-convexity between Cauchy and gate), ``huber`` or ``none``;
-    gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes that carry
-    none from the kept data; correlated : give the correlated error of code receivers a state; time_offset_sigma : s,
-    prior of the receiver's clock offset, a state (zero: none); lever_arm_sigma : m, prior of the lever arm as a state
-    (zero: taken as known)."""
+    gate_probability : share of good fixes inside the gate; estimate_sigma : find the white sigma of fixes that
+    carry none from the kept data; correlated : give the correlated error of code receivers a state;
+    time_offset_sigma : prior of the receiver's clock offset as a state, s (zero: none); lever_arm_sigma : prior of
+    the lever arm as a state, m (zero: taken as known).
+    """
 
     loss: str = "gate"
     gate_probability: float = 0.999
@@ -241,7 +242,7 @@ class PositionBuilder(Builder):
         `level` widens it with the robust level of all rows, so that optimistic sigmas reject nothing wholesale; rows
         whose sigma was estimated get twice the sigma: what tails the noise of such fixes has is part of it.
         """
-        limit = float(chi2.ppf(probability or self.config.gate_probability, 3)) * max(1.0, level)
+        limit = float(chi_square.ppf(probability or self.config.gate_probability, 3)) * max(1.0, level)
         return np.asarray(limit * np.where(self.own_sigma[rows], 1.0, ESTIMATED_TAIL))
 
     @property

@@ -46,8 +46,9 @@ SHARE = 0.1  # of the scatter of the force: what does not average out
 
 @dataclass(frozen=True)
 class GravityConfig:
-    """enabled : ``auto`` (on foot, where no position, velocity or rest has come for `ALONE_S`), ``on``, ``off``;
-    stretch_s : s, over which the force is averaged; speed : m/s, of a person, along one horizontal axis."""
+    """enabled : ``auto`` (on foot, where no position, velocity or rest has come for a minute), ``on``, ``off``;
+    stretch_s : time over which the force is averaged; speed : speed of a person along one horizontal axis, m/s.
+    """
 
     enabled: str = "auto"
     stretch_s: float = 4.0

@@ -48,10 +48,11 @@ NOISIER = 1.5
 
 @dataclass(frozen=True)
 class ImuConfig:
-    """integration_sigma : m/sqrt(s), error of the integration itself; estimate_noise : find noise densities and
-    bias walks from the kept data (batch); scale_sigma : prior of every element of scale and misalignment as a state
-    (0.01 is usual of phones; zero: calibrated, or none); scale_error_share : of a window's turn, that both may be off
-    by in a replay, which neither has that state nor finds its noise."""
+    """integration_sigma : error of the integration itself, m/sqrt(s); estimate_noise : find noise densities and
+    bias walks from the kept data (batch); scale_sigma : prior of every element of scale and misalignment as a state, a
+    ratio (0.01 is usual of phones; zero: calibrated, or none); scale_error_share : share of a window's turn that both
+    may be off by in a replay, which neither has that state nor finds its noise.
+    """
 
     integration_sigma: float = 1e-3
     estimate_noise: bool = True

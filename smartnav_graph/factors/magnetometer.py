@@ -58,8 +58,10 @@ TILT = 0.05
 
 @dataclass(frozen=True)
 class MagnetometerConfig:
-    """enabled : use the magnetometer; loss : of a row, ``none``, ``huber`` or ``cauchy``; gate_sigmas : where intensity
-    or dip is further off than this, against field and hard iron as far as they are known, the row is not used."""
+    """enabled : use the magnetometer; loss : loss of a row, ``none``, ``huber`` or ``cauchy``; gate_sigmas : where
+    intensity or dip is further off than this, against field and hard iron as far as they are known, the row is not
+    used.
+    """
 
     enabled: bool = True
     loss: str = "cauchy"

@@ -43,8 +43,8 @@ LEAST_UPRIGHT = 0.3  # least 1 + R_33: further from upright than 134 deg, yaw sa
 @dataclass(frozen=True)
 class StepConfig:
     """enabled : ``auto`` (in the hand of people on foot, or of a walker where no vehicle is declared), ``on`` or
-    ``off``; spacing_s : fixes better than `GOOD_FIX_M` and closer together than that determine the
-    trajectory by themselves."""
+    ``off``; spacing_s : fixes better than 0.3 m and closer together than that determine the trajectory by themselves.
+    """
 
     enabled: str = "auto"
     spacing_s: float = 5.0

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError, SessionError
@@ -42,11 +41,12 @@ LEAST_GATE_SIGMA = 0.05
 
 @dataclass(frozen=True)
 class PoseFixConfig:
-    """loss, gate_probability : as for GNSS fixes; attitude : use the attitudes of rows that have one;
-    latency_s : known delay of the stamps, a row stamped t is of t - latency_s and became known at t;
-    time_offset_sigma : s, prior of what is left of it, a state (zero: none);
-    lever_arm_sigma : m, prior of the lever arm where the session does not state the mount;
-    mount_sigma_deg : deg, prior of its attitude there."""
+    """loss : as for GNSS fixes, ``gate``, ``gnc``, ``huber`` or ``none``; gate_probability : share of good rows
+    inside the gate; attitude : use the attitudes of rows that have one; latency_s : known delay of the stamps, a
+    row stamped t is of t - latency_s and became known at t; time_offset_sigma : prior of what is left of the delay
+    as a state, s (zero: none); lever_arm_sigma : prior of the lever arm where the session does not state the mount,
+    m; mount_sigma_deg : prior of the attitude of the mount there.
+    """
 
     loss: str = "gate"
     gate_probability: float = 0.999
@@ -227,6 +227,8 @@ def attitudes(stream: PoseFix) -> tuple[Floats, NDArray[np.bool_]]:
     SessionError
         A quaternion is not of unit norm.
     """
+    from scipy.spatial.transform import Rotation
+
     rows = np.full((len(stream), 4), np.nan) if stream.quat is None else np.asarray(stream.quat)
     known = np.isfinite(rows).all(axis=1)
     norm = np.linalg.norm(rows, axis=1)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
@@ -27,7 +26,7 @@ UNKNOWN_PLACE = 1e5  # m
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """angle_sigma : rad, of the first attitude; speed_sigma : m/s, of the first velocity."""
+    """angle_sigma : sigma of the first attitude, rad; speed_sigma : sigma of the first velocity, m/s."""
 
     angle_sigma: float = UNKNOWN_ANGLE
     speed_sigma: float = 100.0
@@ -70,6 +69,8 @@ class PriorBuilder(Builder):
 
     def add(self, update: GraphUpdate, window: Window, previous: State | None, pass_state: PassState) -> None:
         """Prior factors and initial values of the first keyframe; later only zero velocity while the rest lasts."""
+        from scipy.linalg import block_diag
+
         if window.kind != "first":
             if self.rest_end_ns is not None and window.t1_ns <= self.rest_end_ns:
                 still = gtsam.noiseModel.Isotropic.Sigma(3, REST_SPEED)

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 from smartnav_graph.core.so3 import rotate, skew
@@ -125,7 +125,7 @@ class RangeBuilder(Builder):
         distance = max(float(np.linalg.norm(way)), SHORTEST_M)
         variance = float((way / distance) ** 2 @ update.variance) + self.sigma[row] ** 2 + self.bias_sigma**2
         square = (distance - self.distance[row]) ** 2 / variance
-        limit = float(chi2.ppf(self.config.gate_probability, 1)) * max(1.0, self._level.before(square))
+        limit = float(chi_square.ppf(self.config.gate_probability, 1)) * max(1.0, self._level.before(square))
         return "cauchy" if square > limit else "none"
 
     def _add_row(

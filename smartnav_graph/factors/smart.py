@@ -51,8 +51,9 @@ AGAIN = 1e-9
 @dataclass(frozen=True)
 class SmartConfig:
     """enabled : tracks as points in space, in place of image pairs once those are settled (batch, and the polish of a
-    replay); most_seen : observations of one factor, longer tracks are split; least_parallax : rad, between the first
-    ray of a point and another."""
+    replay); most_seen : observations of one factor, longer tracks are split; least_parallax : angle between the first
+    ray of a point and another, rad.
+    """
 
     enabled: bool = False
     most_seen: int = 20

@@ -46,10 +46,10 @@ COMPLIANCE_SIGMA = 0.01  # rad per m/s^2, prior of the compliances
 
 @dataclass(frozen=True)
 class VehicleConfig:
-    """enabled : use the constraint where a vehicle is declared; period_s : at most one row in so many seconds (slip and
+    """enabled : use the constraint where a vehicle is declared; period_s : time between two rows at least (slip and
     springs are not white); mount_sigma_deg : prior of mount pitch and yaw beyond the declared axes; lever_sigma :
-    m, prior of the lever arms, around zero; loss : of a row, ``none``,
-    ``huber`` or ``cauchy``."""
+    prior of the lever arms, around zero, m; loss : loss of a row, ``none``, ``huber`` or ``cauchy``.
+    """
 
     enabled: bool = True
     period_s: float = 1.0

@@ -33,7 +33,7 @@ APART_S = 0.5
 
 @dataclass(frozen=True)
 class VelocityConfig:
-    """gnss : use the velocities that come with GNSS fixes; loss : of a row, ``none``, ``huber`` or ``cauchy``."""
+    """gnss : use the velocities that come with GNSS fixes; loss : loss of a row, ``none``, ``huber`` or ``cauchy``."""
 
     gnss: bool = True
     loss: str = "huber"

@@ -45,8 +45,9 @@ REVERSING = 0.5
 
 @dataclass(frozen=True)
 class WheelConfig:
-    """period_s : at most one row in so many seconds; scale_sigma : prior of the scale;
-    delay_sigma : s, prior of the delay; loss : of a row, ``none``, ``huber`` or ``cauchy``."""
+    """period_s : time between two rows at least; scale_sigma : prior of the scale of the wheel, a ratio;
+    delay_sigma : prior of the delay, s; loss : loss of a row, ``none``, ``huber`` or ``cauchy``.
+    """
 
     period_s: float = 1.0
     scale_sigma: float = 0.03

@@ -27,8 +27,9 @@ GAP_SPACING_S, GAP_SHARE = 0.5, 0.05
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """max_spacing_s : longest window outside gaps (inside, see `GAP_SPACING_S`); merge_s : aiding epochs closer than
-    this share a keyframe; lead_s : how far keyframes reach beyond the first and the last absolute measurement."""
+    """max_spacing_s : longest window outside data gaps; merge_s : aiding epochs closer than this share a keyframe;
+    lead_s : how far keyframes reach beyond the first and the last absolute measurement.
+    """
 
     max_spacing_s: float = 1.0
     merge_s: float = 1e-4

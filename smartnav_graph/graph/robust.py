@@ -11,8 +11,8 @@ from functools import lru_cache
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import ConfigError
 
@@ -31,7 +31,7 @@ def huber_limit(dim: int) -> float:
     than they should, the solution would keep to them less than their sigma says, and the noise of what it keeps to
     instead would be found too small.
     """
-    return float(np.sqrt(chi2.isf(chi2.sf(HUBER**2, 1), dim)))
+    return float(np.sqrt(chi_square.isf(chi_square.sf(HUBER**2, 1), dim)))
 
 
 def check_loss(section: str, loss: str, known: tuple[str, ...] = LOSSES) -> None:
@@ -66,7 +66,7 @@ def loss_weights(square: Floats, loss: str, loss_scale: Floats | float = 1.0, di
 def expected_weighted_square(loss: str, dim: int) -> float:
     """E[w r^2] / dim of a standard normal row of `dim` components under a loss: what its weighted square is on average
     where its sigma is right."""
-    square = chi2.ppf((np.arange(10_000) + 0.5) / 10_000, dim)
+    square = chi_square.ppf((np.arange(10_000) + 0.5) / 10_000, dim)
     return float((loss_weights(square, loss, 1.0, dim)[0] * square).mean() / dim)
 
 
@@ -85,7 +85,7 @@ class PredictionLevel:
     an outlier hardly moves the median, and a solution that diverged soon accepts measurements again."""
 
     def __init__(self, dim: int) -> None:
-        self._median = float(chi2.median(dim))
+        self._median = float(chi_square.ppf(0.5, dim))
         self._squares: deque[float] = deque(maxlen=REMEMBERED)
 
     def before(self, square: float) -> float:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core import figures, frames
 from smartnav_graph.core.arrays import Floats
@@ -249,6 +248,8 @@ def from_columns(
     clock_epoch: str = "unknown",
 ) -> Solution:
     """The inverse of `Solution.all_columns`."""
+
+    from scipy.spatial.transform import Rotation
 
     def stack(*names: str) -> Floats:
         return np.stack([np.asarray(columns[name], dtype=np.float64) for name in names], axis=-1)

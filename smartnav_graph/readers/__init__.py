@@ -1,15 +1,18 @@
 """Foreign logs -> Session. One module per format; `READERS` lists them.
 
-A reader changes units and the sign of specific force, never axes, and keeps the source's own clock.
+A reader changes units and the sign of specific force, never axes, and keeps the source's own clock. Other packages add
+readers by entry points of the group ``smartnav_graph.readers``; see docs/how-to/own-factor.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import file_inside
+from smartnav_graph.core.plugins import installed_parts
 from smartnav_graph.readers import (
     colmap,
     comma2k19,
@@ -63,7 +66,13 @@ READERS: dict[str, Reader] = {
     )
 }
 
-__all__ = ["READERS", "Reader", "find", "is_unknown", "load", "read"]
+__all__ = ["READERS", "Reader", "find", "is_unknown", "known_readers", "load", "read"]
+
+
+@cache
+def known_readers() -> Mapping[str, Reader]:
+    """`READERS`, and those of other installed packages, by name."""
+    return {**READERS, **installed_parts("smartnav_graph.readers", Reader, READERS)}
 
 
 def load(source: str | Path, *, repairs: Iterable[str] = ()) -> Session:
@@ -90,7 +99,7 @@ def is_unknown(source: str | Path) -> bool:
     path = Path(source)
     if not path.exists() or (path / "session.toml").is_file() or is_archive(path):
         return False
-    return not any(reader.matches(str(source)) for reader in READERS.values())
+    return not any(reader.matches(str(source)) for reader in known_readers().values())
 
 
 def find(source: str | Path, name: str | None = None) -> Reader:
@@ -101,14 +110,14 @@ def find(source: str | Path, name: str | None = None) -> Reader:
     SessionError
         The name is unknown, the source is missing, or none or several readers recognise it.
     """
-    names = ", ".join(READERS)
-    if name is not None and name not in READERS:
+    names = ", ".join(known_readers())
+    if name is not None and name not in known_readers():
         raise SessionError("--format", f"unknown format {name!r}", f"one of {names}", "see `smartnav formats`")
-    found = [reader for reader in READERS.values() if reader.matches(str(source))]
+    found = [reader for reader in known_readers().values() if reader.matches(str(source))]
     if not found and not Path(source).exists():
         raise SessionError(source, "does not exist", "a file, a folder, gtsam-kitti or gtsam-euroc", "check the path")
     if name is not None:
-        return READERS[name]
+        return known_readers()[name]
     found = [reader for reader in found if not reader.general] or found
     if len(found) > 1:
         several = ", ".join(reader.name for reader in found)
@@ -156,5 +165,5 @@ def _without_pictures(found: Session) -> Session:
 def _entry(folder: Path) -> Path:
     """The only file of an unpacked folder, where a reader recognises it; else the folder."""
     files = list(folder.iterdir())
-    alone = len(files) == 1 and any(reader.matches(str(files[0])) for reader in READERS.values())
+    alone = len(files) == 1 and any(reader.matches(str(files[0])) for reader in known_readers().values())
     return files[0] if alone else folder

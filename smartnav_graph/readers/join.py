@@ -19,7 +19,6 @@ from smartnav_graph.readers.positions.listed import SurveyedPoints, is_control, 
 from smartnav_graph.readers.positions.places import fitting_systems
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.detect.standstills import StandstillConfig, find_standstills
-from smartnav_graph.session.health.facts import fix_sigma
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Located, Stream
 from smartnav_graph.session.streams import GnssFix, PoseFix
@@ -216,6 +215,8 @@ def _stops(session: Session, vehicle: str, least_s: float) -> Times:
 
 def _nearest_in_order(session: Session, points: SurveyedPoints, stops: Times) -> list[int]:
     """Indices of the stops, increasing, at which the fixes are nearest to the points: dynamic programming."""
+    from smartnav_graph.session.health.facts import fix_sigma
+
     fixes = session.gnss
     assert fixes is not None and session.frame is not None
     where, at = session.nav_position(fixes)[:, :2], session.frame.nav_from_lla(np.nan_to_num(points.rows))[:, :2]

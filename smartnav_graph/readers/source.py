@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from smartnav_graph.core.arrays import Floats, Table, Times
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.session.folder import build_stream
-from smartnav_graph.session.health.units import in_right_units
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
@@ -109,7 +108,11 @@ def build_session(tables: Mapping[str, tuple[Path, Table]], repairs: tuple[str, 
         streams[name], counts = build_stream(STREAMS[name], columns, file, repairs)
         dropped |= {name: counts} if counts else {}
     session = Session(dropped=dropped, **{**header, **streams})
-    return in_right_units(session) if "units" in repairs else session
+    if "units" not in repairs:
+        return session
+    from smartnav_graph.session.health.units import in_right_units  # which loads what `formats` does not need
+
+    return in_right_units(session)
 
 
 def example_file(name: str) -> Path:

@@ -20,7 +20,6 @@ from smartnav_graph.core.progress import Progress, silent, watched
 from smartnav_graph.core.tables import structured
 from smartnav_graph.session import repair
 from smartnav_graph.session.calibration.model import calibration_toml, load_calibration
-from smartnav_graph.session.health.units import in_right_units
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.stream import Stream
 from smartnav_graph.session.streams import STREAMS
@@ -158,6 +157,8 @@ def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
     SessionError
         Folder or file missing, unreadable or empty; wrong column; non-finite value; stamps not increasing.
     """
+    from smartnav_graph.session.health.units import in_right_units
+
     folder = Path(path)
     if not folder.is_dir():
         raise SessionError(folder, "is no folder", "a session folder", "make one with `smartnav import`")

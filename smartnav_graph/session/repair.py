@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core.arrays import Column, Indices, Mask, Table, Times
 from smartnav_graph.core.errors import ConfigError, SessionError
@@ -174,6 +173,8 @@ def _steady(t: Times) -> Times:
     since = np.asarray(t - t[0], dtype=np.float64)
     slope = float(rows @ since / (rows @ rows))
     width = max(3, round(4.0 * NS / slope)) | 1 if slope > 0 else 3
+    from scipy.ndimage import uniform_filter1d
+
     smooth = uniform_filter1d(since - slope * rows, width, mode="reflect") + slope * rows
     return np.asarray(np.rint(smooth).astype(np.int64) + t[0], dtype=np.int64)
 

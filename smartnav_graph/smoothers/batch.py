@@ -33,8 +33,9 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """settle_s : s, after which the latest updates are solved by themselves, so that later windows start from a solved
-    state; longest_settle_s : s, to which it grows as the gyro bias becomes known."""
+    """settle_s : time after which the latest updates are solved by themselves, so that later windows start from a
+    solved state; longest_settle_s : time to which it grows as the gyro bias becomes known.
+    """
 
     settle_s: float = 30.0
     longest_settle_s: float = 240.0

@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.linalg import lapack
 
 from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.graph.states import dims_of
@@ -146,6 +145,8 @@ def _upper(rows: int, columns: int) -> Mask:
 
 def _eliminated(fronts: _Fronts, columns: _Columns) -> list[Floats]:
     """[R S] of each group of states, forward in time."""
+    from scipy.linalg import lapack
+
     found, rest, kept = [], np.zeros((0, 0)), np.zeros(0, dtype=np.intp)
     for group, own in enumerate(columns.own):
         rows, front = len(rest), fronts.matrix(group)
@@ -164,6 +165,8 @@ def _earlier(conditional: Floats, own: int, later: Floats, first: int, columns: 
 
     first : column of the group's first state, for the error where R is singular
     """
+    from scipy.linalg import lapack
+
     if len(conditional) < own:
         raise columns.fault(first + len(conditional))
     inverse, fault = lapack.dtrtri(conditional[:, :own])

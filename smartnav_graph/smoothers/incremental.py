@@ -28,9 +28,10 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """smoother : fixed-lag or isam2; lag_s : s, fixed lag; relinearize : factor on the step sizes that call for a
-    new linearisation; hold : in isam2, keep clock offsets, lever arms and the like at their prior means; polish : solve
-    everything once more at the end."""
+    """smoother : the smoother, ``fixed-lag`` or ``isam2``; lag_s : lag of the fixed-lag smoother; relinearize :
+    factor on the step sizes that call for a new linearisation, a ratio; hold : in isam2, keep clock offsets, lever
+    arms and the like at their prior means; polish : solve everything once more at the end.
+    """
 
     smoother: str = "fixed-lag"
     lag_s: float = 10.0

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.graph.states import KEYFRAME_LETTERS, STATES, SessionState, State, key
@@ -64,6 +63,8 @@ class Isam2(Incremental):
 
     def _marginal(self, update: GraphUpdate) -> Floats:
         """Blocks of pose, velocity and bias alone: the engine gives no more."""
+        from scipy.linalg import block_diag
+
         return np.asarray(
             block_diag(*(self._engine.marginalCovariance(key(letter, update.index)) for letter in KEYFRAME_LETTERS))
         )

@@ -24,8 +24,9 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 @dataclass(frozen=True)
 class SolveConfig:
     """max_iterations : most steps of one solve; tolerance : relative decrease of the cost that ends it, together with
-    step_tolerance : the largest step, in units of a third of a radian, 100 m, 10 m/s. Gauss-Newton steps shrink
-    quadratically: after one of 1e-3 the next would be of 1e-6."""
+    step_tolerance, a ratio; step_tolerance : the largest step, a ratio of a third of a radian, 100 m, 10 m/s.
+    Gauss-Newton steps shrink quadratically: after one of 1e-3 the next would be of 1e-6.
+    """
 
     max_iterations: int = 50
     tolerance: float = 1e-5

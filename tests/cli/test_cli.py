@@ -1,18 +1,22 @@
 """The command line, end to end on small simulated sessions: what it writes, says, refuses and returns."""
 
 import csv
-import dataclasses
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import tyro
 
 import smartnav_graph as sn
+from smartnav_graph.calibrate import KINDS
 from smartnav_graph.cli import COMMANDS, command_class, demo, main
-from smartnav_graph.cli.help import described, field_texts
-from smartnav_graph.cli.options import Configured, Estimating, join_values, parse
+from smartnav_graph.cli.help import arguments_of, configuration_options, help_text, shown_value
+from smartnav_graph.cli.options import Configured, Estimating, join_values, parse, with_options
 from smartnav_graph.estimate import config as config_model
 from smartnav_graph.output.run_folder import read_run
 from smartnav_graph.session.streams import Images
@@ -412,29 +416,54 @@ def test_help_fits_a_screen(call, command):
     assert len(lines) <= 24 and max(map(len, lines)) <= 80
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if issubclass(command_class(name), Configured)])
-def test_every_option_has_a_sentence_and_is_there_once(call, name):
-    out = call(f"{name} --help-all")[1]
-    options = command_class(name).configuration()
-    for section in dataclasses.fields(options):
-        texts = described(section.default_factory)
-        for field in dataclasses.fields(section.default_factory):
-            assert len(texts[field.name]) > 3, f"{section.name}.{field.name}"
-            assert f"--{section.name}.{field.name}".replace("_", "-") in out
-    assert "--run.vehicle" not in out and "--vehicle.enabled" not in out
-    assert max(len(line) for line in out.splitlines() if not line.startswith("Example")) <= 80
+def every_command():
+    """Every command, with its kinds."""
+    for name in COMMANDS:
+        kinds = [*KINDS, "show", "compare", "apply", "board", "undistort"] if name == "calibrate" else [""]
+        for kind in kinds:
+            yield command_class(name).narrowed(name, [kind] if kind else [])[:2]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_option_of_a_command_has_a_text(name):
-    kind = command_class(name)
-    texts = field_texts(kind)
-    assert all(texts.get(field.name) for field in dataclasses.fields(kind) if field.name != "options")
+@pytest.mark.filterwarnings("ignore:get_parser:DeprecationWarning")
+@pytest.mark.parametrize(("kind", "name"), [pytest.param(*one, id=one[1]) for one in every_command()])
+def test_the_parser_takes_what_help_all_shows_each_once_with_sentence_and_unit(kind, name):
+    options = [*arguments_of(kind), *(configuration_options(kind) if issubclass(kind, Configured) else [])]
+    shown = [option.name for option in options if not option.positional]
+    whole = with_options(kind, kind.configuration()) if issubclass(kind, Configured) else kind
+    actions = tyro.extras.get_parser(whole)._actions
+    parsed = [text.replace("_", "-") for action in actions for text in action.option_strings[:1]]
+    known = {"-h", "--tyro-print-completion", "--tyro-write-completion"}
+    assert sorted(shown) == sorted(set(parsed) - known)
+    text = help_text(kind, name, everything=True)
+    for option in options:
+        assert re.match(r"([A-Z\d]|chessboard|orb).{7,}", option.text)
+        switch = option.value == "" and not option.section
+        assert option.positional or switch or option.value, f"{option.name} has no unit"
+        assert len(re.findall(rf"^  {re.escape(option.name)}(?: |$)", text, re.MULTILINE)) == 1
+    assert max(len(line) for line in text.splitlines() if not line.startswith("Example")) <= 80
+
+
+def test_an_option_is_there_once():
+    shown, batch = ([o.name for o in configuration_options(command_class(name))] for name in ("replay", "smooth"))
+    assert not {"--run.vehicle", "--vehicle.enabled", "--replay.smoother", "--replay.lag-s"} & set(shown)
+    assert "--replay.polish" in shown and "--replay.lag-s" in batch
+
+
+def test_units_come_from_the_name_or_the_text():
+    found = {o.name: o.value for o in configuration_options(command_class("smooth"))}
+    assert found["--prior.angle-sigma"] == "RAD" and found["--gaps.missing-s"] == "S"
+    assert found["--imu.integration-sigma"] == "M/SQRT(S)" and found["--smart.most-seen"] == "N"
+    assert found["--gnss.loss"] == "gate|gnc|huber|none" and found["--image-pairs.spans"] == "N ..."
+
+
+def test_values_are_shown_with_eight_digits():
+    assert shown_value(1.8137993642342178) == "1.8137994" and shown_value((1, 2)) == "1 2"
+    assert (shown_value(None), shown_value(True), shown_value("")) == ("not set", "true", "none")
 
 
 def test_a_kind_of_calibration_shows_its_own_options(call):
     out = call("calibrate camera --help")[1]
-    assert "--board VALUE" in out and "Name of the camera" in out
+    assert "--board TEXT" in out and "Name of the camera" in out
 
 
 def test_config_is_dumped_as_a_file_that_can_be_read(call, tmp_path):
@@ -466,3 +495,45 @@ def test_rows_that_are_faulty_are_refused_and_repaired_when_asked(call, tmp_path
 def test_a_copy_of_a_run_is_still_a_run(call, workshop, tmp_path):
     shutil.copytree(workshop / "run", tmp_path / "moved")
     assert call(f"compare run {tmp_path}/moved")[0] == 0
+
+
+# Completion: what the shell asks, and what it is answered.
+
+
+def completed(line: str, folder) -> list[str]:
+    env = {**os.environ, "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_COMP_WORDBREAKS": ""}
+    env |= {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_STDOUT_FILENAME": str(folder / "out")}
+    subprocess.run([sys.executable, "-m", "smartnav_graph"], env=env, cwd=folder, check=True, timeout=60)
+    return [word.split(":")[0].strip() for word in (folder / "out").read_text().split("\n") if word]
+
+
+def test_commands_options_values_and_files_are_completed(tmp_path):
+    (tmp_path / "walk").mkdir()
+    assert completed("smartnav sm", tmp_path) == ["smooth"]
+    assert "camera-imu" in completed("smartnav calibrate cam", tmp_path)
+    assert {"--withhold", "--vehicle"} <= set(completed("smartnav smooth walk --", tmp_path))
+    assert set(completed("smartnav smooth walk --vehicle ", tmp_path)) == {"none", "car", "trolley", "foot"}
+    assert completed("smartnav smooth walk --gnss.lo", tmp_path) == ["--gnss.loss"]
+    assert "huber" in completed("smartnav smooth walk --gnss.loss ", tmp_path)
+    assert any(word.startswith("walk") for word in completed("smartnav smooth wa", tmp_path))
+
+
+def test_the_scripts_of_the_shells_call_the_command(call):
+    for shell, word in (("bash", "complete -o"), ("zsh", "compdef"), ("fish", "complete --command smartnav")):
+        code, out, _ = call(f"completion {shell}")
+        assert code == 0 and word in out and "smartnav" in out
+    assert call("completion tcsh")[0] == 2
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_with_the_script(workshop):
+    program = workshop / "bin" / "smartnav"
+    program.parent.mkdir(exist_ok=True)
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m smartnav_graph "$@"\n')
+    program.chmod(0o755)
+    line = "smartnav ex"
+    script = f"""eval "$(smartnav completion bash)"; COMP_LINE='{line}'; COMP_POINT={len(line)}
+COMP_WORDS=({line}); COMP_CWORD=1; COMP_TYPE=9; _python_argcomplete smartnav; echo "${{COMPREPLY[@]}}" """
+    env = {**os.environ, "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], env=env, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["explain", "export"], done.stderr

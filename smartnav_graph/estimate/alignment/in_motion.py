@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import exp, skew
 from smartnav_graph.core.timebase import NS
@@ -31,7 +31,7 @@ UNMODELLED = 2.0
 # Noise of the unmeasured motion inside a gap: m/s^2 and rad/s per sqrt(Hz).
 GAP_ACCEL, GAP_GYRO = 0.25, 0.05
 KICK_S = 10.0
-LIMIT = float(chi2.ppf(0.999, 3))  # of the squares of fixes that agree
+LIMIT = float(chi_square.ppf(0.999, 3))  # of the squares of fixes that agree
 GROWTH = 1.4  # of mu, an iteration
 STEPS = 80
 MOST_FIXES = 300

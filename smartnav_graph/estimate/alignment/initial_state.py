@@ -16,7 +16,8 @@ from smartnav_graph.graph.pass_state import PassState
 @dataclass(frozen=True)
 class InitialiseConfig:
     """stretch_s : first windows used; max_stretch_s : how far the stretch grows while the heading stays open;
-    starts : headings tried; rest_s : shortest rest that counts."""
+    starts : number of headings tried; rest_s : shortest rest that counts.
+    """
 
     stretch_s: float = 30.0
     max_stretch_s: float = 120.0

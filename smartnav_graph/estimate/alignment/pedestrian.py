@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
@@ -121,6 +120,8 @@ def walked(
 
 def _least(cost: Callable[[float], float], sigma: float) -> float:
     """The bias of least cost: the best of a grid, refined."""
+    from scipy.optimize import minimize_scalar
+
     grid = np.linspace(-3.0 * sigma, 3.0 * sigma, COARSE_BIASES)
     best = float(grid[np.argmin([cost(b) for b in grid])])
     step = float(grid[1] - grid[0])

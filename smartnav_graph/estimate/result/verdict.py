@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.stats import chi2 as chi_square
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Times, runs
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
@@ -361,6 +360,8 @@ def _left_out(inputs: VerdictInputs) -> Iterator[Reason]:
 def interpolated(t_ns: Times, kept_ns: Times, position: Floats) -> tuple[Floats, Floats]:
     """Positions (n, 3) at t_ns (n,) by the line and by the cubic spline through those (m, 3) at kept_ns (m,); at both
     ends, beyond them, constant."""
+    from scipy.interpolate import CubicSpline
+
     first = np.flatnonzero(np.concatenate([[True], np.diff(kept_ns) > 0]))
     seconds = (kept_ns[first] - kept_ns[0]) / NS
     at = (np.clip(t_ns, kept_ns[0], kept_ns[-1]) - kept_ns[0]) / NS

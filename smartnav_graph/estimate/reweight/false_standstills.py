@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.factors.standstill import StandstillBuilder
@@ -23,7 +23,7 @@ from smartnav_graph.session.detect.standstills import Standstills
 from smartnav_graph.smoothers.estimate import Estimate
 
 # The square that a good keyframe exceeds once in a million times, sigma a few times too small; the share of them.
-LIMIT = 9.0 * float(chi2.isf(1e-6, 3))
+LIMIT = 9.0 * float(chi_square.isf(1e-6, 3))
 MOST = 0.5
 
 

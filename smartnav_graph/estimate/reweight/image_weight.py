@@ -16,8 +16,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.estimate.reweight.image_pair_outliers import WITHOUT_IMAGES, Positions
 from smartnav_graph.estimate.reweight.outliers import position_builders
 from smartnav_graph.factors.coplanarity import COMPRESSED, COPIED, IN_USE, SHARED, CoplanarityBuilder
@@ -68,7 +68,7 @@ def _misfit(builders: Sequence[Builder], estimate: Estimate, rare: float) -> flo
     imu = one_of(builders, ImuBuilder)
     names = {builder.name for builder in position_builders(builders)} | ({imu.name} if imu is not None else set())
     fits = [(f.square, f.residuals - f.fitted) for name, f in redundancies(estimate).items() if name in names]
-    return max((square / dof for square, dof in fits if dof >= 1.0 and chi2.sf(square, dof) < rare), default=1.0)
+    return max((square / dof for square, dof in fits if dof >= 1.0 and chi_square.sf(square, dof) < rare), default=1.0)
 
 
 def _change(estimate: Estimate, pass_state: PassState) -> float:

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.factors import imu_intrinsics
 from smartnav_graph.factors.imu import CLASS_WEIGHT, ImuBuilder, accel_part, integration_part
@@ -69,7 +69,8 @@ class Component(NamedTuple):
     @property
     def is_known(self) -> bool:
         """Whether the data say enough of this group: by their number, or by how far off they are."""
-        return self.redundancy >= LEAST_REDUNDANCY or self.square > chi2.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
+        limit = chi_square.ppf(1.0 - SURPRISE, max(self.redundancy, 1.0))
+        return self.redundancy >= LEAST_REDUNDANCY or bool(self.square > limit)
 
     def scale(
         self, before: float, weight: float, most: float = WIDEST, level: float = 1.0, prior: float = 1.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import rotate, skew
 from smartnav_graph.core.timebase import NS
@@ -130,7 +130,7 @@ class Verdict:
 
     def relative(self, probability: float | None = None) -> Floats:
         """Squares (m,) in units of the gate's."""
-        level = float(np.median(self.square)) / float(chi2.median(self.dim))
+        level = float(np.median(self.square)) / float(chi_square.ppf(0.5, self.dim))
         return np.asarray(self.square / self.limit(level, probability))
 
 
@@ -167,7 +167,8 @@ def _block_verdict(builder: Builder, estimate: Estimate) -> list[Verdict]:
     dim = white[0].shape[1]
 
     def limit(level: float, probability: float | None) -> Floats:
-        return np.full(len(square), chi2.ppf(probability or builder.gate_probability, dim) * max(1.0, level))
+        share = probability or builder.gate_probability or 1.0
+        return np.full(len(square), chi_square.ppf(share, dim) * max(1.0, level))
 
     rows = np.concatenate([stack.rows for stack in stacks])
     return [Verdict(builder.name, rows, square, dim, limit)]

@@ -16,8 +16,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Mask, runs
 from smartnav_graph.estimate.reweight.constraint_noise import row_scales
 from smartnav_graph.estimate.reweight.false_standstills import drop_standstills
@@ -173,7 +173,7 @@ def _shrink_robust_scale(found: Mapping[str, tuple[PositionBuilder, FixResiduals
     """The next least sigma (m) of fixes under the loss: a share of this one, less where most fixes agree better, none
     once it would be below what is known of them."""
     known = [(float(np.median(one.sigma[:, :2])), float(np.median(one.square))) for _, one in found.values()]
-    level = chi2.median(3)
+    level = float(chi_square.ppf(0.5, 3))
     wanted = min(NARROWER * control, 2.0 * max(sigma * np.sqrt(max(square / level, 1.0)) for sigma, square in known))
     return float(wanted) if wanted > min(sigma for sigma, _ in known) else 0.0
 
@@ -292,7 +292,7 @@ def _stated(builder: PositionBuilder, found: FixResiduals, used: Mask, pass_stat
     if known is None or not known.is_noise or redundancy < PRIOR_FIXES:
         return {}
     square, before = float(((found.residual / found.sigma)[counted] ** 2).sum()), pass_state.scale(name)
-    if before == 1.0 and chi2.sf(square, redundancy) > RARE:
+    if before == 1.0 and chi_square.sf(square, redundancy) > RARE:
         return {}
     most = max(1.0, TAILS * known.sigma / float(np.median(builder.sigma[found.rows[used], :2])))
     wanted = np.sqrt((before**2 * square + PRIOR_FIXES) / (redundancy + PRIOR_FIXES))

@@ -10,17 +10,18 @@ Source: Mahony, Hamel, Pflimlin (2008), Nonlinear complementary filters on SO(3)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.so3 import chained
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Complexes = NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
@@ -96,11 +97,15 @@ def step_means(imu: Imu) -> tuple[Floats, Floats]:
 
 def _attitude(gyro: Floats) -> Rotation:
     """Attitude (n,) in the middle of each step, in a frame that does not turn."""
+    from scipy.spatial.transform import Rotation
+
     return chained(STEP_S * gyro) * Rotation.from_rotvec(-0.5 * STEP_S * gyro)
 
 
 def _vertical(force: Floats, width_s: float) -> Floats:
     """Unit vectors (n, 3) along the mean of specific force (n, 3) in a frame that does not turn."""
+    from scipy.ndimage import gaussian_filter1d
+
     seconds = np.arange(0, len(force), _PER_SECOND)
     mean = np.add.reduceat(force, seconds) / np.diff(np.append(seconds, len(force)))[:, None]
     up = gaussian_filter1d(mean, width_s, axis=0, mode="nearest", truncate=3.0)
@@ -111,6 +116,8 @@ def _vertical(force: Floats, width_s: float) -> Floats:
 
 def _to_vertical(up: Floats) -> Rotation:
     """The smallest rotations that turn vectors (n, 3) to the third axis."""
+    from scipy.spatial.transform import Rotation
+
     axis = np.stack([up[:, 1], -up[:, 0], np.zeros(len(up))], axis=1)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     return Rotation.from_rotvec(axis / np.maximum(sine, 1e-12) * np.arctan2(sine, up[:, 2:]))

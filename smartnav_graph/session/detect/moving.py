@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
-from scipy.stats import t as student_t
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Times, runs
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA, GnssNoise
@@ -181,7 +180,7 @@ class _Positions:
         weight = t - t.mean()
         weight /= weight @ weight
         drift = correlated**2 * np.exp(-np.abs(t[:, None] - t) / self.correlated_s)
-        rare = student_t.isf(norm.sf(SIGNIFICANT), len(t) - 2)
+        rare = chi_square.student_limit(SIGNIFICANT, len(t) - 2)
         square = (rare * white) ** 2 * (weight @ weight) + SIGNIFICANT**2 * (weight @ drift @ weight)
         if speed < LEAST_SPEED or speed**2 < THEIL_SEN * square:
             return 0.0

@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.signal.windows import hann
-from scipy.stats import chi2
 
+from smartnav_graph.core import chi_square
 from smartnav_graph.core.arrays import Floats, Indices, Mask, Times
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.session.streams import Imu
@@ -106,7 +105,7 @@ def _scatter(t_ns: Times, position: Floats, units: Floats) -> Scatter:
 
 def _without_outliers(t_ns: Times, position: Floats, units: Floats) -> Indices:
     """Rows without those that disagree with their neighbours most, one among neighbours at a time; at least half."""
-    kept, limit = np.arange(len(t_ns)), float(chi2.ppf(SUSPECT, position.shape[1]))
+    kept, limit = np.arange(len(t_ns)), float(chi_square.ppf(SUSPECT, position.shape[1]))
     while True:
         residual = normalised_residuals(t_ns[kept], position[kept]) / units[kept]
         square = np.pad(np.nan_to_num((residual**2).sum(axis=1)), 2)
@@ -124,7 +123,7 @@ def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
     first = np.flatnonzero(np.concatenate([[True], np.diff(t_ns) > 0])[: len(t_ns)])
     if len(first) >= LEAST_FIXES:
         residual = normalised_residuals(t_ns[first], position[first])
-        limit = chi2.ppf(AGREES, position.shape[1]) * max(_sigma(residual), 1e-9) ** 2
+        limit = chi_square.ppf(AGREES, position.shape[1]) * max(_sigma(residual), 1e-9) ** 2
         out[first] = np.nan_to_num((residual**2).sum(axis=1), nan=np.inf) < limit
     return out
 
@@ -132,7 +131,7 @@ def agrees_with_neighbours(t_ns: Times, position: Floats) -> Mask:
 def _sigma(residual: Floats) -> float:
     square = (residual**2).sum(axis=1)
     dim = residual.shape[1]
-    return float(np.sqrt(np.quantile(square[np.isfinite(square)], QUANTILE) / chi2.ppf(QUANTILE, dim)))
+    return float(np.sqrt(np.quantile(square[np.isfinite(square)], QUANTILE) / chi_square.ppf(QUANTILE, dim)))
 
 
 def sampling_noise(imu: Imu) -> tuple[float, float]:
@@ -160,7 +159,7 @@ def _spectrum(values: Floats, rows: int) -> Floats:
     """
     pieces = sliding_window_view(values, rows, axis=0)[:: rows - rows // 2]
     line = np.linalg.qr(np.vander(np.arange(rows), 2))[0]
-    window = hann(rows, sym=False)
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi / rows * np.arange(rows))  # Hann
     power = np.abs(np.fft.rfft(window * (pieces - (pieces @ line) @ line.T))) ** 2 / (window**2).sum()
     power[..., 1 : (rows + 1) // 2] *= 2.0
     even = 2.0 * np.arange(1.0, (len(pieces) - 1) // 2 + 1)

@@ -20,7 +20,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from smartnav_graph.core.arrays import Floats, runs
 from smartnav_graph.core.timebase import NS
@@ -62,6 +61,8 @@ def is_foot_mounted(blocks: Blocks, vehicle: str) -> bool:
 
 
 def _mean(rows: Floats, width: int) -> Floats:
+    from scipy.ndimage import uniform_filter1d
+
     return np.asarray(uniform_filter1d(rows, width, axis=0, mode="nearest"))
 
 
@@ -96,6 +97,8 @@ def stance_speed(imu: Imu, gravity: float, detector: str = "shoe") -> Floats:
 
     sigma = ARM sqrt(T) RATE_UNIT: if all of the statistic T were rate, the speed at `ARM` from the turning point.
     """
+    from scipy.ndimage import minimum_filter1d
+
     period = float(np.median(np.diff(imu.t_ns))) / NS
     width = max(3, round(STANCE_S / period) | 1)
     statistic = np.maximum(DETECTORS[detector](imu, width, gravity), 1e-12)

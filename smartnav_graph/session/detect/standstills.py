@@ -50,10 +50,10 @@ class StandstillConfig:
     use_listed : use the periods of static.parquet; detect : find standstills in the inertial data
     standing : a pedestrian at rest with the device in the hand has zero velocity, within that of the hand; never on
     wheels
-    detector : ``shoe``, ``are`` or ``amv``, for stances; mounting : ``foot``, ``body``, or ``auto`` (as the
+    detector : detector of stances, ``shoe``, ``are`` or ``amv``; mounting : ``foot``, ``body``, or ``auto`` (as the
     session declares it, else by the data)
-    zupt : zero velocity; zaru : zero angular rate; flat_floor : all stances are on one level
-    floor_sigma : m, of a stance's level
+    zupt : zero velocity at standstills; zaru : zero angular rate at rest; flat_floor : all stances are on one level
+    floor_sigma : sigma of a stance's level, m
     """
 
     use_listed: bool = True

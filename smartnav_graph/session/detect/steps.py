@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import firwin
 
 from smartnav_graph.core.arrays import Floats, Indices, Times
 from smartnav_graph.core.frames import STANDARD_GRAVITY
@@ -94,6 +93,8 @@ def find_steps(imu: Imu) -> Steps:
 
 def _swinging(imu: Imu) -> Floats:
     """|specific force| (n,) m/s^2 at `RATE_HZ` from the first sample on: low-passed, less its mean so far."""
+    from scipy.signal import firwin
+
     seconds = (imu.t_ns - imu.t_ns[0]) / NS
     grid = np.arange(0.0, seconds[-1], 1.0 / RATE_HZ)
     size = np.interp(grid, seconds, np.linalg.norm(imu.accel, axis=1))

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Indices, Mask
 from smartnav_graph.core.frames import STANDARD_GRAVITY
@@ -43,6 +41,8 @@ def quiet_accel(imu: Imu) -> float | None:
     Quiet: on every axis accel varies by less than 0.4 m/s^2 and gyro by less than 0.05 rad/s (standard deviations),
     several times the noise of a phone at rest and less than any step or engine under load.
     """
+    from scipy.ndimage import uniform_filter1d
+
     imu = decimated(imu)
     if len(imu) < 6:
         return None
@@ -128,6 +128,8 @@ def tilt_errors(
     -------
     Median angle in degrees by s; None when fewer than ten windows qualify.
     """
+    from scipy.ndimage import uniform_filter1d
+
     imu = decimated(imu)
     step = period(imu)
     n = round(window_s / step)
@@ -147,6 +149,8 @@ def tilt_errors(
 
 
 def _median_angle_deg(imu: Imu, start: Indices, n: int, s: float, up_0: Floats, up_1: Floats) -> float:
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.identity(len(start))
     for row in (start + i for i in range(n)):
         dt = (imu.t_ns[row + 1] - imu.t_ns[row])[:, None] / NS

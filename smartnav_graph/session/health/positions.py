@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.timebase import NS, interpolate
@@ -24,6 +24,9 @@ from smartnav_graph.session.health.facts import (
 )
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Positioned
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _MAX_FIX_SPEED = 100.0  # m/s; faster than any car
 _FAR_M = 50_000.0  # two sensors of one session
@@ -242,6 +245,8 @@ def _velocities(facts: Facts) -> Iterator[Finding]:
 
 def _attitudes(facts: Facts) -> Iterator[Finding]:
     """Attitudes of pose fixes against the gyro between them and the accelerometer."""
+    from scipy.spatial.transform import Rotation
+
     fixes, imu = facts.session.pose_fixes, facts.imu
     if fixes is None or fixes.quat is None or imu is None:
         return
@@ -278,6 +283,8 @@ def _attitudes(facts: Facts) -> Iterator[Finding]:
 
 def _turn(t_ns: Times, gyro: Floats, begin: int, end: int) -> Rotation:
     """Rotation of the body from `begin` to `end` by its rates."""
+    from scipy.spatial.transform import Rotation
+
     inside = t_ns[(t_ns > begin) & (t_ns < end)]
     edges = np.concatenate([[begin], inside, [end]])
     rate = interpolate(edges, t_ns, gyro)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from smartnav_graph.core import frames
 from smartnav_graph.core.arrays import Floats, Times
@@ -80,6 +79,8 @@ def _field(facts: Facts) -> Iterator[Finding]:
 def _turning_field(facts: Facts) -> float | None:
     """Size (uT) of the field that turns in the body: of B - h, with dB = -dtheta x (B - h), about the axes that the
     device turns about. None where it does not turn enough to find the offset h."""
+    from scipy.ndimage import uniform_filter1d
+
     stream, imu = facts.session.magnetometer, facts.imu
     if stream is None or imu is None:
         return None
@@ -128,6 +129,8 @@ def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
 
 def _field_turns(facts: Facts, t_ns: Times, field: Floats) -> Iterator[Finding]:
     """Changes of the field over a second against those predicted from gyro, B(t + dt) = Exp(-w dt) B(t)."""
+    from scipy.ndimage import uniform_filter1d
+
     imu = facts.imu
     assert imu is not None
     every = min(max(1, round(NS / float(np.median(np.diff(t_ns))))), len(t_ns))
