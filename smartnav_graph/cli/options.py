@@ -35,7 +35,7 @@ class Command:
     debug: Switch = False
     """Show the traceback of an error."""
 
-    # What stands in the place of arguments in the line of usage, where there are none.
+    # What the line of usage has as arguments where the class has none.
     PLACE: ClassVar[str] = ""
 
     @classmethod
