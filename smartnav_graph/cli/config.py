@@ -21,4 +21,5 @@ class ConfigCommand(Configured):
         from smartnav_graph.estimate.config import Config, dumps
 
         config = self.resolved()
-        print(dumps(config) if self.dump else dumps(config, beside=Config()), end="")
+        text = dumps(config) if self.dump else dumps(config, beside=Config())
+        print(text or "# every option has its default; --dump prints all of them\n", end="")

@@ -13,6 +13,7 @@ import tyro
 from smartnav_graph.cli.options import Reporting, SessionCommand, Switch, repairs
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.output.progress import progress
+from smartnav_graph.output.text import Row, Table
 
 if TYPE_CHECKING:
     from smartnav_graph.evaluation.intervals import FixesFromReference, Interval
@@ -102,13 +103,13 @@ def numbers(option: str, text: str) -> list[float]:
 def intervals_text(found: Sequence[Interval]) -> str:
     """A table: one line for each interval and kind, figures averaged over the seeds."""
     names = ("mean_m", "p67_m", "p95_m", "rmse_m", "horizontal_mean_m")
-    heading = "".join(f"{name:>10}" for name in ("mean m", "67 % m", "95 % m", "RMS m", "mean 2-D"))
-    lines = [f"{'every s':>8} {'kind':<11}{'seeds':>6}{'rows':>8}{heading}"]
+    heading = ("kind", "every s", "seeds", "rows", "mean m", "67 % m", "95 % m", "RMS m", "mean 2-D m")
+    table = []
     groups: dict[tuple[float, str], list[Interval]] = {}
     for row in found:
         groups.setdefault((row.every_s, row.kind), []).append(row)
     for (every, kind), rows in groups.items():
         figures = [[x for row in rows if (x := getattr(row, name)) is not None] for name in names]
-        cells = "".join(f"{np.mean(x):>10.4f}" if x else f"{'-':>10}" for x in figures)
-        lines.append(f"{every:>8g} {kind:<11}{len(rows):>6}{sum(row.n for row in rows):>8}{cells}")
-    return "\n".join(lines)
+        counts = (f"{every:g}", str(len(rows)), str(sum(row.n for row in rows)))
+        table.append(Row((kind, *counts, *(f"{np.mean(x):.4f}" if x else "-" for x in figures))))
+    return Table(heading, table).text()

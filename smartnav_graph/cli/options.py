@@ -67,9 +67,13 @@ class Reporting(Command):
 
     def report(self, figures: object, text: str) -> None:
         """Print the figures as JSON, or the text."""
+        from smartnav_graph.cli.text import print_findings
         from smartnav_graph.output.summary_json import plain
 
-        print(dumps(plain(figures), allow_nan=False) if self.json else text)
+        if self.json:
+            print(dumps(plain(figures), allow_nan=False))
+        else:
+            print_findings(text)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,8 +33,9 @@ STYLES = {
 
 
 def print_findings(text: str) -> None:
-    """Lines on stdout, coloured by severity on a terminal."""
-    console = Console(soft_wrap=True, highlight=False)
+    """Lines on stdout; on a terminal wrapped at words and coloured by severity, in a pipe each in one piece."""
+    console = Console(highlight=False)
+    console.soft_wrap = not console.is_terminal
     for line in inert(text).splitlines():
         console.print(Text(line, style=STYLES.get(line.split(" ", 1)[0], "")))
 

@@ -18,6 +18,10 @@ from smartnav_graph.evaluation.metrics import Statistics
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, ROT, VEL, Solution
 
 DEG = float(np.degrees(1.0))
+# What two solutions of one problem differ by for rounding alone: beside 1 (rad, m, m/s ...) or the size of the state.
+ROUNDING = 1e-9
+# Figures that agree to this share are the same: they are shown with six digits.
+SHOWN = 1e-6
 
 
 class Measure(NamedTuple):
@@ -130,14 +134,22 @@ def compare(first: Solution, second: Solution) -> Comparison:
         raise SessionError("compare", "the two runs have no time in common", "two runs of one session")
     at = other.at(inside.t_ns)
     bias, sigma = (interpolate(inside.t_ns, second.t_ns, values) for values in (_biases(second), second.sigmas))
+    difference = np.concatenate([_differences(inside, at), bias - _biases(first)[rows]], axis=1)
     return Comparison(
         t_ns=inside.t_ns,
         t0_ns=first.t0_ns,
         position=inside.position,
-        difference=np.concatenate([_differences(inside, at), bias - _biases(first)[rows]], axis=1),
+        difference=_beyond_rounding(difference, inside.position),
         sigma_first=first.sigmas[rows],
         sigma_second=sigma,
     )
+
+
+def _beyond_rounding(difference: Floats, position: Floats) -> Floats:
+    """Differences (n, 15) with zero where they are rounding of the states."""
+    size = np.ones(15)
+    size[POS] += np.abs(position).max()
+    return np.where(np.abs(difference) > ROUNDING * size, difference, 0.0)
 
 
 def _biases(solution: Solution) -> Floats:
@@ -178,10 +190,19 @@ FIGURES = (
 
 
 def figure_differences(first: Mapping[str, object], second: Mapping[str, object]) -> dict[str, tuple[object, object]]:
-    """Figures that differ between two tables of summary.json: path -> the value of each, None where it has none."""
+    """Figures that differ between two tables of summary.json by more than rounding: path -> the value of each, None
+    where it has none."""
     one, other = _figures(first), _figures(second)
     names = [*one, *(name for name in other if name not in one)]
-    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
+    pairs = {name: (one.get(name), other.get(name)) for name in names}
+    return {name: pair for name, pair in pairs.items() if not _alike(*pair)}
+
+
+def _alike(one: object, other: object) -> bool:
+    """Whether two figures are the same, numbers but for rounding."""
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) <= SHOWN * max(abs(one), abs(other))
+    return one == other
 
 
 def _figures(summary: Mapping[str, object]) -> dict[str, object]:

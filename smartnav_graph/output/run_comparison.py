@@ -16,7 +16,7 @@ FEW = 8
 COLUMNS = ("RMS", "median", "95 %", "largest", "at s", "in sigmas", "sigma 2/1")
 MEANING = (
     "in sigmas: the largest difference over the larger sigma of the two runs; "
-    "sigma 2/1: median sigma of the second run over that of the first"
+    "sigma 2/1: median sigma of the second run over that of the first; differences of rounding are 0"
 )
 
 
@@ -38,18 +38,22 @@ class RunDifferences:
 
     def to_text(self) -> str:
         """Tables in fixed width."""
-        states = "\n".join([self._title(), *self._states()])
-        tables = [table for name in ("config", "figures") if (table := self._table(name))]
-        return "\n\n".join([states, *tables, *(["\n".join(lines)] if (lines := list(self._rejected())) else [])])
+        first, *rest = (table.text() for table in self._tables())
+        rejected = ["\n".join(lines)] if (lines := list(self._rejected())) else []
+        return "\n\n".join([f"{self._title()}\n\n{first}\n\n{MEANING}", *rest, *rejected])
 
     def to_markdown(self) -> str:
         """The same as Markdown."""
-        tables = [Table(("", *COLUMNS), [Row(self._row(measure)) for measure in MEASURES])]
+        first, *rest = (table.markdown() for table in self._tables())
+        return "\n\n".join([self._title(), first, MEANING, *rest, *(f"- {line}" for line in self._rejected())])
+
+    def _tables(self) -> Iterator[Table]:
+        """Differences of the states, options that differ, figures that differ."""
+        yield Table(("", *COLUMNS), [Row(self._row(measure)) for measure in MEASURES])
         for name in ("config", "figures"):
             rows = [Row((key, _shown(one), _shown(other))) for key, (one, other) in getattr(self, name).items()]
-            tables += [Table((name, self.first.path.name, self.second.path.name), rows)] if rows else []
-        first, *rest = (table.markdown() for table in tables)
-        return "\n\n".join([self._title(), first, MEANING, *rest, *(f"- {line}" for line in self._rejected())])
+            if rows:
+                yield Table((name, self.first.path.name, self.second.path.name), rows)
 
     def write_recording(self, path: Path, *, force: bool) -> None:
         """Both runs as one recording; see `rerun_log.comparison`."""
@@ -72,23 +76,12 @@ class RunDifferences:
         common = f"{len(self.states)} common epochs (of {counts[0]} and {counts[1]}{few})"
         return f"{self.second.path} minus {self.first.path} at {common}"
 
-    def _states(self) -> Iterator[str]:
-        yield f"{'':<16}{''.join(f'{name:>11}' for name in COLUMNS)}"
-        for measure in MEASURES:
-            name, *cells = self._row(measure)
-            yield f"{name:<16}{''.join(f'{text:>11}' for text in cells)}"
-        yield MEANING
-
     def _row(self, measure: Measure) -> tuple[str, ...]:
         one = self.states.statistics(measure)
         s = one.statistics
         figures = ["-" if value is None else f"{value:.4g}" for value in (s.rmse, s.p50, s.p95, s.max)]
         name = f"{measure.name.split('_')[0]}{' bias' if 'bias' in measure.name else ''} {measure.unit}"
         return (name, *figures, f"{one.largest_at_s:.2f}", f"{one.largest_sigmas:.2f}", f"{one.sigma_ratio:.3f}")
-
-    def _table(self, name: str) -> str:
-        rows: Mapping[str, tuple[object, object]] = getattr(self, name)
-        return "\n".join(f"{name:<8} {key}: {_shown(one)} | {_shown(other)}" for key, (one, other) in rows.items())
 
     def _rejected(self) -> Iterator[str]:
         for sensor, sets in self.rejected.items():

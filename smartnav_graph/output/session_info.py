@@ -9,7 +9,7 @@ import numpy as np
 
 from smartnav_graph.core.files import file_inside
 from smartnav_graph.core.timebase import NS, utc_from_gps
-from smartnav_graph.output.text import duration
+from smartnav_graph.output.text import Row, Table, duration
 from smartnav_graph.session.detect.clock import spaced_rows
 from smartnav_graph.session.health import Health
 from smartnav_graph.session.session import Session
@@ -33,10 +33,11 @@ class SessionInfo:
             f"clock: {health.clock_epoch}, time zero {health.t0_ns} ns",
             f"place: {self._where()}",
         ]
-        lines.append(f"{'stream':<14}{'rows':>9}{'start s':>12}{'length s':>12}{'rate Hz':>10}")
-        lines += [
-            f"{s.name:<14}{s.rows:>9}{s.start_s:>12.3f}{s.length_s:>12.3f}{s.rate_hz:>10.2f}" for s in health.streams
-        ]
+        rows = []
+        for one in health.streams:
+            rate = f"{one.rate_hz:.2f}" if one.rows > 1 else "-"
+            rows.append(Row((one.name, str(one.rows), f"{one.start_s:.3f}", f"{one.length_s:.3f}", rate)))
+        lines.append(Table(("stream", "rows", "start s", "length s", "rate Hz"), rows).text())
         listed, there = self._pictures()
         if listed:
             lines.append(f"pictures: {there} of {listed}")

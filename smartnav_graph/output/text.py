@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from io import StringIO
 
 from smartnav_graph.output.summary_json import as_float
 
@@ -125,6 +126,23 @@ class Table:
     def _row(row: Row, kind: Sequence[str]) -> str:
         cells = "".join(f"<td{k}>{escape(c)}</td>" for c, k in zip(row.cells[1:], kind[1:], strict=True))
         return f'<tr{attributes(row.data)}><th scope="row">{escape(row.cells[0])}</th>{cells}</tr>'
+
+    def text(self, width: int = 80) -> str:
+        """A table in fixed width for terminals and pipes, cells wrapped at words."""
+        from rich.console import Console
+        from rich.table import Table as Grid
+        from rich.text import Text
+
+        between = 2 if len(self.header) < 8 else 1
+        grid = Grid(box=None, pad_edge=False, padding=(0, between, 0, 0), header_style="")
+        for i, name in enumerate(self.header):
+            grid.add_column(Text(name), justify="left" if i == 0 or i in self.words else "right", vertical="bottom")
+        for row in self.rows:
+            grid.add_row(*map(Text, row.cells))
+        console = Console(file=StringIO(), width=width, color_system=None, force_terminal=False, legacy_windows=False)
+        with console.capture() as capture:
+            console.print(grid)
+        return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
     def markdown(self) -> str:
         """A GitHub-flavoured Markdown table."""

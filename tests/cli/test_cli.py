@@ -17,8 +17,10 @@ from smartnav_graph.calibrate import KINDS
 from smartnav_graph.cli import COMMANDS, command_class, demo, main
 from smartnav_graph.cli.help import arguments_of, configuration_options, help_text, shown_value
 from smartnav_graph.cli.options import Configured, Estimating, join_values, parse, with_options
+from smartnav_graph.cli.text import print_findings
 from smartnav_graph.estimate import config as config_model
 from smartnav_graph.output.run_folder import read_run
+from smartnav_graph.output.text import Row, Table
 from smartnav_graph.session.streams import Images
 from smartnav_graph.smoothers.incremental import Incremental
 
@@ -190,7 +192,7 @@ def test_compare_tells_how_far_two_runs_are_apart(call, tmp_path):
     assert other["config"] == {"run.withhold": [["gnss:every=2"], []], "replay.lag_s": [10.0, 5.0]}
     assert other["figures"]["mode"] == ["batch", "replay fixed-lag"]
     code, out, _ = call(f"compare run replay --out {tmp_path}/both.rrd")
-    assert code == 0 and "replay.lag_s: 10 | 5" in out and (tmp_path / "both.rrd").stat().st_size > 10_000
+    assert code == 0 and re.search(r"replay\.lag_s +10 +5", out) and (tmp_path / "both.rrd").stat().st_size > 10_000
     code, _, err = call(f"compare run replay --out {tmp_path}/both.rrd")
     assert code == 1 and "both.rrd: exists already" in err
 
@@ -252,6 +254,26 @@ def test_demo_touches_no_folder_but_its_own(call, tmp_path):
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["letter.txt"]
     demo.claim(tmp_path / "demo")
     demo.claim(tmp_path / "demo")  # its own it may take again
+
+
+def test_lines_are_wrapped_at_words_on_a_terminal_and_whole_in_a_pipe(monkeypatch, capsys):
+    text = "warning: gnss: 12 rows outside the inertial span; not used as recorded"
+    print_findings(text)
+    assert capsys.readouterr().out == f"{text}\n"
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "40")
+    print_findings(text)
+    lines = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()
+    assert len(lines) > 1 and max(map(len, lines)) <= 40
+    assert " ".join(line.strip() for line in lines) == text  # no word is cut
+
+
+def test_a_table_fits_80_columns_and_cuts_no_word():
+    rows = [Row(("position m", "0.2647", "a rather long text of several words that has to be wrapped somewhere " * 2))]
+    text = Table(("", "RMS", "remark"), rows, frozenset({2})).text()
+    assert max(map(len, text.splitlines())) <= 80 and "0.2647" in text
+    assert sorted(" ".join(text.split()).split()) == sorted(("RMS remark " + " ".join(rows[0].cells)).split())
+    assert "[gnss:every=2]" in Table(("a", "b"), [Row(("x", "[gnss:every=2]"))]).text()  # no markup
 
 
 # What is refused. A named error is 1 and one line; what the options do not allow is 2.

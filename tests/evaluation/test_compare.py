@@ -101,3 +101,14 @@ def test_only_figures_that_differ_are_reported():
         "used.gnss": (None, 7),
     }
     assert figure_differences(one, one) == {}
+
+
+def test_rounding_is_no_difference(first):
+    """One unit in the last place of every number: two runs on two machines."""
+    changed = {name: np.nextafter(getattr(first, name), np.inf) for name in ("nav_t_body", "nav_v_body", "gyro_bias")}
+    found = compare(first, replace(first, **changed))
+    assert (found.difference == 0.0).all() and found.statistics(BY_NAME["position_m"]).statistics.max == 0.0
+    off = compare(first, replace(first, nav_t_body=first.nav_t_body + 1e-6))  # a micrometre is more than rounding
+    assert found.t_ns is not None and (off.difference[:, 3:6] != 0.0).all()
+    assert figure_differences({"path_m": 18.7299001}, {"path_m": 18.7299002}) == {}
+    assert figure_differences({"path_m": 18.7299}, {"path_m": 18.7300}) == {"path_m": (18.7299, 18.7300)}

@@ -1,6 +1,7 @@
 """Two runs beside each other, in words and tables."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +26,9 @@ def test_text_has_differences_and_options(runs):
     found = compare_runs(*runs)
     text = found.to_text()
     assert text.startswith(f"{runs[1].path} minus {runs[0].path} at {len(found.states)} common epochs (of ")
-    assert "config   run.withhold: [] | [gnss:every=2]" in text
-    assert "figures  withheld.gnss: - | " in text
+    assert re.search(r"^run\.withhold +\[\] +\[gnss:every=2\]$", text, re.MULTILINE)
+    assert re.search(r"^withheld\.gnss +- +[\d.]+$", text, re.MULTILINE)
+    assert max(len(line) for line in text.splitlines()[1:] if line != MEANING) <= 80
     (line,) = [line for line in text.splitlines() if line.startswith("horizontal m")]
     largest = found.states.statistics(MEASURES[1])
     assert MEANING in text.splitlines()

@@ -29,7 +29,7 @@ def test_when_and_where(session):
         "time: 2025-06-01T10:00:00.000Z to 2025-06-01T10:00:59.990Z, 60.0 s",
         "clock: unix, time zero 1748772000000000000 ns",
         "place: 52.0",
-        "imu                6000",
+        "imu        6000    0.000",
         "gaps: 0",
         "missing: nothing",
     ):

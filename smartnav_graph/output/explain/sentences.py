@@ -24,7 +24,7 @@ from smartnav_graph.output.explain.figures import (
 )
 from smartnav_graph.output.explain.nearby import Nearby, Span
 from smartnav_graph.output.summary_json import GAP_KINDS
-from smartnav_graph.output.text import listed
+from smartnav_graph.output.text import Row, Table, listed
 
 # A smaller share of a variance is left out of the sentences.
 SMALL_SHARE = 0.1
@@ -51,28 +51,28 @@ def sentences(found: Explanation, near: Nearby) -> list[str]:
 def variance_table(found: Explanation) -> str:
     """Variance of each quantity by source, and the shifts at the keyframe by source."""
     names = [SHORT.get(quantity.name, quantity.name) for quantity in QUANTITIES]
-    lines = ["", f"{'variance by source':<18}{''.join(f'{name:>10}' for name in names)}"]
     shares = np.array([found.share(quantity) for quantity in QUANTITIES]).T
-    for source, row in zip(found.keyframe.sources, shares, strict=True):
-        lines.append(f"{source:<18}{''.join(f'{share:>10.1%}' for share in row)}")
-    lines.append(f"{'sigma':<18}{''.join(f'{found.sigma(quantity):>10.3g}' for quantity in QUANTITIES)}")
-    lines.append(f"{'':<18}{''.join(f'{quantity.unit:>10}' for quantity in QUANTITIES)}")
-    at_epoch = "".join(f"{found.measured_at_epoch(quantity):>10.1%}" for quantity in QUANTITIES)
-    lines.append(f"{'from this epoch':<18}{at_epoch}")
-    return "\n".join([*lines, *(_shift_lines(found) if found.balanced else [])])
+    rows = [
+        (source, *(f"{share:.1%}" for share in row)) for source, row in zip(found.keyframe.sources, shares, strict=True)
+    ]
+    rows.append(("sigma", *(f"{found.sigma(quantity):.3g}" for quantity in QUANTITIES)))
+    rows.append(("", *(quantity.unit for quantity in QUANTITIES)))
+    rows.append(("from this epoch", *(f"{found.measured_at_epoch(quantity):.1%}" for quantity in QUANTITIES)))
+    table = Table(("variance by source", *names), list(map(Row, rows)))
+    return "\n".join(["", table.text(), *(_shift_tables(found) if found.balanced else [])])
 
 
-def _shift_lines(found: Explanation) -> list[str]:
+def _shift_tables(found: Explanation) -> Iterator[str]:
     """Shifts in sigmas: of all factors of a source, and of those that touch the keyframe."""
-    sides = "".join(f"{name:>10}" for name in ("east", "north", "up", "clockwise"))
-    lines = ["", f"{'shift in sigmas':<18}{sides}   {'at keyframe':>11}{sides}"]
-    h = found.keyframe
-    for source, shift, count, near in zip(h.sources, h.shift, h.touching, h.shift_at_keyframe, strict=True):
-        by_all, by_these = (
-            "".join(f"{round(x, 2) + 0.0:>+10.2f}" for x in shifts(part).values()) for part in (shift, near)
-        )
-        lines.append(f"{source:<18}{by_all}   {count:>11}{by_these if count else ''}".rstrip())
-    return lines
+    sides, h = ("east", "north", "up", "clockwise"), found.keyframe
+    rows = zip(h.sources, h.shift, h.touching, h.shift_at_keyframe, strict=True)
+    by_all, by_these = [], []
+    for source, shift, count, near in rows:
+        cells, close = ([f"{round(x, 2) + 0.0:+.2f}" for x in shifts(part).values()] for part in (shift, near))
+        by_all.append(Row((source, *cells)))
+        by_these.append(Row((source, *(close if count else [""] * len(close)), str(count))))
+    yield "\n" + Table(("shift in sigmas", *sides), by_all).text()
+    yield "\n" + Table(("at this keyframe", *sides, "factors"), by_these).text()
 
 
 def _epoch(found: Explanation) -> str:
