@@ -3,7 +3,8 @@
 trajectory.csv, causal.csv (replay), solution.parquet, causal.parquet (replay), residuals.parquet, withheld.parquet,
 imu.parquet (as used: corrected, gaps bridged), keyframes.parquet, influence.parquet (the linear system at the solution,
 see `evaluation.influence`), summary.json,
-config.toml, calibration.toml, report.html, run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
+config.toml, calibration.toml, report.html and its tables (report.json, control_points.csv, rejected.csv,
+settings.csv), run.rrd, latency.rrd (replay, opened with run.rrd): all of them, or nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from smartnav_graph.output.summary_json import Summary, as_float, numbers_of, pl
 from smartnav_graph.session.calibration import model as calibration_model
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
-from smartnav_graph.session.streams import Imu
+from smartnav_graph.session.streams import ControlPoint, Imu
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -215,14 +216,23 @@ def residual_columns(residuals: Residuals) -> Columns:
 
 
 def withheld_columns(run: Run) -> Columns:
-    """The columns of withheld.parquet: predicted minus recorded, metres; empty without withheld rows."""
+    """The columns of withheld.parquet: predicted minus recorded, metres, and the names of control points; empty without
+    withheld rows."""
     if not run.withheld:
         return {}
     names = [np.full(len(rows.t_ns), name) for name, rows in run.withheld.items()]
     error = np.concatenate([rows.error for rows in run.withheld.values()])
     t_ns = np.concatenate([rows.t_ns for rows in run.withheld.values()])
     errors = dict(zip(("de_m", "dn_m", "du_m"), error.T, strict=True))
-    return {"t_ns": t_ns, "sensor": np.concatenate(names)} | errors
+    columns = {"t_ns": t_ns, "sensor": np.concatenate(names)} | errors
+    points = run.problem.withheld.get("control")
+    if isinstance(points, ControlPoint) and "control" in run.withheld:
+        ids = dict(zip(points.t_ns.tolist(), map(str, points.point_id), strict=True))
+        is_point = (columns["sensor"] == "control").tolist()
+        columns["point_id"] = np.array(
+            [ids[t] if own else "" for t, own in zip(t_ns.tolist(), is_point, strict=True)], dtype=object
+        )
+    return columns
 
 
 def recorded(run: Run) -> Session:
@@ -248,6 +258,7 @@ def _write_views(
     progress: Progress,
 ) -> None:
     from smartnav_graph.output.report import report_markdown, write_report
+    from smartnav_graph.output.report.tables import write_tables
     from smartnav_graph.output.rerun_log import write_latency, write_recording
 
     session, updates = recorded(run), None if run.diagnostics is None else run.diagnostics.updates
@@ -280,6 +291,7 @@ def _write_views(
             updates=updates,
             config=run.problem.config,
         )
+        write_tables(folder, session=session, solution=run.solution, summary=summary, config=run.problem.config)
 
 
 def read_run(path: str | Path) -> StoredRun:

@@ -46,7 +46,7 @@ def test_every_file_of_a_batch_run(run, tmp_path):
     write_run(run, tmp_path / "run")
     expected = {"trajectory.csv", "solution.parquet", "residuals.parquet", "withheld.parquet", "summary.json"}
     expected |= {"config.toml", "calibration.toml", "report.html", "run.rrd", "influence.parquet", "keyframes.parquet"}
-    expected |= {"imu.parquet"}
+    expected |= {"imu.parquet", "report.json", "settings.csv"}
     assert {file.name for file in (tmp_path / "run").iterdir()} == expected
     assert [file.name for file in tmp_path.iterdir()] == ["run"]  # no temporary left beside it
 
