@@ -69,6 +69,7 @@ class Replay(Estimating):
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> int:
     """Load, estimate, write, print; the exit code."""
     from smartnav_graph import readers
+    from smartnav_graph.estimate.both_ways import both_ways
     from smartnav_graph.estimate.replay import replay
     from smartnav_graph.estimate.run import smooth
     from smartnav_graph.output.run_folder import check_out, write_run
@@ -82,7 +83,10 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
         load_s = time.perf_counter() - begin
         run = (replay if causal else smooth)(session, config, progress=show)
         evaluation = against_own_reference(run)
-        summary = write_run(run, command.out, force=command.force, evaluation=evaluation, load_s=load_s, progress=show)
+        ways = both_ways(session, config, show) if config.report.forward_backward else None
+        summary = write_run(
+            *(run, command.out), force=command.force, evaluation=evaluation, ways=ways, load_s=load_s, progress=show
+        )
     if "interrupted" in text_of(summary, "mode") and not command.quiet:
         print("smartnav: interrupted; the part that was done is written", file=sys.stderr)
     print_findings(run_text(summary, command.out))

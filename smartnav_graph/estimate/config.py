@@ -95,13 +95,15 @@ class ReportConfig:
     """What the report shows beside the run.
 
     company : name above the title; logo : PNG, JPEG, SVG or WebP file beside it; time_zone : of local times, such as
-    Europe/Berlin, never guessed; crs : system of the coordinates of control points, such as EPSG:25832
+    Europe/Berlin, never guessed; crs : system of the coordinates of control points, such as EPSG:25832;
+    forward_backward : compare the filter forward and backward in time, which takes two replays
     """
 
     company: str = ""
     logo: str = ""
     time_zone: str = ""
     crs: str = ""
+    forward_backward: bool = False
 
     def __post_init__(self) -> None:
         if self.logo and Path(self.logo).suffix.lower() not in LOGOS:

@@ -28,6 +28,7 @@ from smartnav_graph.core.files import read_table, refuse_existing, refuse_foreig
 from smartnav_graph.core.frames import Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate import config as config_model
+from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.result.summary import run_facts
 from smartnav_graph.estimate.run import Run
 from smartnav_graph.evaluation import Evaluation
@@ -105,6 +106,7 @@ def write_run(
     report: bool = True,
     recording: bool = True,
     evaluation: Evaluation | None = None,
+    ways: BothWays | None = None,
     load_s: float = 0.0,
     progress: Progress = silent,
 ) -> Summary:
@@ -116,6 +118,7 @@ def write_run(
     force : replace an older run; a folder that is no run is never replaced
     report, recording : write report.html, run.rrd
     evaluation : comparison with a reference, shown in both and written to summary.json
+    ways : the filter forward and backward, shown in the report
     load_s : seconds that reading the session took
     progress : called with what is being written
 
@@ -144,7 +147,7 @@ def write_run(
             calibration = calibration_model.calibration_toml(run.problem.calibration)
             (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
             views = {"report": report, "recording": recording}
-            _write_views(run, folder, _plain_table(summary), evaluation, views, progress)
+            _write_views(run, folder, _plain_table(summary), evaluation, views, progress, ways)
             written = _plain_table(_timed(summary, load_s, time.perf_counter() - begin))
             text = json.dumps(written, indent=2, ensure_ascii=False, allow_nan=False)
             (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
@@ -256,6 +259,7 @@ def _write_views(
     evaluation: Evaluation | None,
     views: Mapping[str, bool],
     progress: Progress,
+    ways: BothWays | None,
 ) -> None:
     from smartnav_graph.output.report import report_markdown, write_report
     from smartnav_graph.output.report.tables import write_tables
@@ -290,6 +294,7 @@ def _write_views(
             withheld=run.withheld,
             updates=updates,
             config=run.problem.config,
+            ways=ways,
         )
         write_tables(folder, session=session, solution=run.solution, summary=summary, config=run.problem.config)
 

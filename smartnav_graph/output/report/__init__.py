@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from smartnav_graph.core.files import replacing
+from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.evaluation import Evaluation
@@ -39,6 +40,7 @@ def write_report(
     withheld: Mapping[str, Scored] | None = None,
     updates: Updates | None = None,
     config: Config | None = None,
+    ways: BothWays | None = None,
 ) -> None:
     """Write the report of one run as a single HTML file; an older file at `path` is replaced.
 
@@ -52,6 +54,7 @@ def write_report(
     causal : the causal states of a replay
     withheld : by sensor, errors at withheld measurements: ``t_ns`` (n,) int64 and ``error`` (n, 3) m east, north, up
     updates : of a replay
+    ways : the filter forward and backward
     config : options of the run, and company, logo, time zone and coordinate system of the report
 
     Raises
@@ -59,7 +62,7 @@ def write_report(
     SessionError
         The file cannot be written.
     """
-    text = page(session, solution, summary, evaluation, causal, withheld or {}, updates, config)
+    text = page(session, solution, summary, evaluation, causal, withheld or {}, updates, config, ways)
     with replacing(path) as new:
         new.write_text(text, encoding="utf-8")
 

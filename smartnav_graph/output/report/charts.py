@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import ACCEL_BIAS, GYRO_BIAS, POS, Solution
@@ -270,6 +271,28 @@ def withheld(name: str, scored: Scored, solution: Solution, gaps: Intervals) -> 
     plot.dots((np.asarray(scored.t_ns) - solution.t0_ns) / 1e9, horizontal, "withheld")
     marks = [("dots withheld", "Withheld measurement"), ("line s3", "1 sigma of the solution"), *shaded(gaps)]
     return picture + figure([plot], marks)
+
+
+def forward_backward(ways: BothWays, solution: Solution, gaps: Intervals) -> str:
+    """Difference of the filter forward and backward in time, with two sigmas of it."""
+    t = (ways.t_ns - solution.t0_ns) / 1e9
+    inside = np.abs(ways.difference) <= 2.0 * ways.sigma
+    largest = max(float(np.percentile(np.abs(ways.difference), 99)), 3.0 * float(np.median(ways.sigma)))
+    plots, limits = [], axis([-largest, largest], count=4)
+    for i, name in enumerate(AXES):
+        plot = over_time(solution, limits, f"{name}, forward less backward [m]", gaps, 130)
+        plot.band(t, -2.0 * ways.sigma[:, i], 2.0 * ways.sigma[:, i], f"s{i}")
+        plot.line(t, ways.difference[:, i], f"s{i} solid")
+        plots.append(plot)
+    rms = np.sqrt((ways.difference**2).mean(axis=0))
+    text = (
+        "The filter with all measurements, forward in time less backward in time. Both are causal: at an epoch they "
+        f"have only its own measurements in common. RMS east {metres(rms[0])}, north {metres(rms[1])}, up "
+        f"{metres(rms[2])}; {number(100.0 * float(inside.mean()))} % inside two sigma (expected 95 %). Sigmas are "
+        "large at the ends, where one of the two has just begun."
+    )
+    entries = [*((f"line s{i} solid", name) for i, name in enumerate(AXES)), ("band s0", "± 2 sigma of the difference")]
+    return f"<p>{escape(text)}</p>" + figure(plots, [*entries, *shaded(gaps)])
 
 
 def errors_over_time(evaluation: Evaluation, solution: Solution, gaps: Intervals) -> str:

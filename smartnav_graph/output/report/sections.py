@@ -9,6 +9,7 @@ from html import escape
 import numpy as np
 from markupsafe import Markup
 
+from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.result.diagnostics import Updates
 from smartnav_graph.evaluation import Evaluation
@@ -47,6 +48,7 @@ def page(
     scored: Mapping[str, charts.Scored],
     updates: Updates | None = None,
     config: Config | None = None,
+    ways: BothWays | None = None,
 ) -> str:
     """The whole HTML text."""
     gaps = imu_gaps(summary)
@@ -67,6 +69,7 @@ def page(
         gap_section(summary, gaps),
         *plots_over_time(solution, shaded, causal_solution),
         section("updates", "Real-time (causal) performance", causal.draw(updates, solution, shaded) if updates else ""),
+        section("both-ways", "Forward and backward", charts.forward_backward(ways, solution, shaded) if ways else ""),
         withheld_section(summary, scored, solution, shaded),
         against_reference(evaluation, solution, shaded),
         *estimation(summary),

@@ -13,6 +13,7 @@ from lxml import html
 from pyproj import Transformer
 
 from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config, ReportConfig, RunConfig
 from smartnav_graph.graph.solution import Residuals
 from smartnav_graph.output.report import write_report
@@ -163,3 +164,11 @@ def test_control_points_in_a_national_system(tmp_path, surveyed):
     assert (lat - origin.lat_deg) * 111_200 == pytest.approx(given[1], rel=0.01)
     assert h - origin.height_m == pytest.approx(given[2], abs=0.2)  # curvature of the Earth
     assert "ETRS89 / UTM zone 32N" in facts(dom)["Coordinates"][-1]
+
+
+def test_forward_and_backward_are_compared(tmp_path, case):
+    sigma = np.full((len(case.solution), 3), 0.5)
+    ways = BothWays(case.solution.t_ns, np.tile([0.3, -0.4, 1.2], (len(sigma), 1)), sigma)
+    (found,) = page(tmp_path, case, ways=ways).xpath('//section[@id="both-ways"]')
+    assert "RMS east 0.300 m, north 0.400 m, up 1.20 m; 66.7 % inside two sigma" in found.text_content()
+    assert not page(tmp_path, case).xpath('//section[@id="both-ways"]')
