@@ -157,6 +157,7 @@ def outputs(cell: nbformat.NotebookNode, alternative: str) -> Iterator[str | tup
             yield base64.b64decode(data["image/png"]), alternative
         elif "text/html" in data:
             table = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
+            table = table.replace("<table>", '<table class="facts">')  # the theme would wrap it a second time
             yield f'<div class="output" tabindex="0" role="region" aria-label="output">{table}</div>'
         elif text := WARNING.sub(r"\1", CONTROL.sub("", data["text/plain"])).rstrip():
             yield f'```text title="Output"\n{text}\n```'

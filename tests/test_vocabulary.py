@@ -35,6 +35,7 @@ PHRASES = (
 # Names of recordings and scenarios, and words for real things: simulated rooms, a photographed door.
 PROPER = re.compile(r"lund_door|(?:rendered-)?room-\d+s|rendered-room")
 REAL = {"smartnav_graph/simulation": {"room", "rooms"}, "datasets": {"room", "rooms", "door"}}
+REAL["docs"] = {"room"}
 # Whole names of functions, classes, modules, arguments and fields; they may name a local variable.
 NAMES = {
     *("Step", "Tag", "Block", "Stack", "Memory", "settled", "revise", "_revised", "_grown", "widened", "_narrower"),
@@ -127,7 +128,8 @@ def test_docstrings_comments_and_messages_are_the_fields() -> None:
 
 def test_pages_are_the_fields() -> None:
     found = []
-    for path in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "datasets").glob("*.md"))]:
+    site = [path for path in sorted((ROOT / "docs").rglob("*")) if path.suffix in (".md", ".py")]
+    for path in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "datasets").glob("*.md")), *site]:
         if path.name != "CHANGELOG.md":  # it names what was renamed
             place, text = path.relative_to(ROOT), path.read_text(encoding="utf-8")
             found += [f"{place}: {part!r}" for part in found_in(text, real_words(place))]

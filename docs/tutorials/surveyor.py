@@ -131,9 +131,12 @@ plt.show()
 # ## The path in UTM, with its sigmas
 
 # %%
-table = pd.DataFrame({"E": east, "N": north, "h": path.height_m}).join(path[["sigma_e_m", "sigma_n_m", "sigma_u_m"]])
-table.to_csv("path-utm.csv", index=False, float_format="%.4f")
-table.iloc[::600].round(3)
+# !smartnav export final --format csv --crs EPSG:32632 --out path-utm.csv --quiet
+
+# %%
+table = pd.read_csv("path-utm.csv")
+utm = ["epsg32632_east_m", "epsg32632_north_m", "epsg32632_height_m"]
+table[[*utm, "sigma_e_m", "sigma_n_m", "sigma_u_m"]].iloc[::600].round(3)
 
 # %% [markdown]
 # ## May I sign this?
@@ -150,7 +153,7 @@ for reason in summary["verdict"]["reasons"]:
     print(f"{reason['sensor']}: {reason['text']}; {reason['remedy']}")
 
 # %% [markdown]
-# What the three words mean, and what to look at before you sign: [How sure can I be?](../understand/sure.md)
+# What the three words mean, and what to look at before you sign: [Can I rely on it?](../understand/sure.md)
 #
 # The figures of this page come from a simulated recording, so that the page can be rebuilt anywhere; what real
 # recordings gave is under [Comparison with other software](../understand/comparison.md).
