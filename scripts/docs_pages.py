@@ -38,7 +38,7 @@ from smartnav_graph.session.stream import Stream
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-WARNING = re.compile(r"(?m)^\S+\.py:\d+: (\w*Warning: .*)\n  .*$")
+WARNING = re.compile(r"(?m)^\S+\.py:\d+: (?=\w*Warning: )")
 CELL_SECONDS = 240
 FIRST = ("load", "smooth", "run", "Session", "Solution", "Run")
 _made = dict[tuple[str, str], dict[str, str | bytes]]()
@@ -159,8 +159,15 @@ def outputs(cell: nbformat.NotebookNode, alternative: str) -> Iterator[str | tup
             table = re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL)
             table = table.replace("<table>", '<table class="facts">')  # the theme would wrap it a second time
             yield f'<div class="output" tabindex="0" role="region" aria-label="output">{table}</div>'
-        elif text := WARNING.sub(r"\1", CONTROL.sub("", data["text/plain"])).rstrip():
+        elif text := plain_text(data["text/plain"], cell.source):
             yield f'```text title="Output"\n{text}\n```'
+
+
+def plain_text(text: str, source: str) -> str:
+    """Text without codes of the terminal, and warnings without the place of the cell, which is that of a kernel."""
+    echoed = {f"  {line.strip()}" for line in source.splitlines()}
+    lines = WARNING.sub("", CONTROL.sub("", text)).rstrip().splitlines()
+    return "\n".join(line for line in lines if line not in echoed or "Warning: " not in text)
 
 
 # --------------------------------------------------------------------------------------------------- references
