@@ -19,7 +19,7 @@ from smartnav_graph.estimate.preparation import PREPARE, on_one_datum
 from smartnav_graph.factors import FACTORS, make_builders
 from smartnav_graph.factors.context import FactorContext
 from smartnav_graph.graph import delayed
-from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows
+from smartnav_graph.graph.keyframes import KeyframeConfig, keyframe_times, make_windows, turn_times
 from smartnav_graph.graph.update import Builder
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.calibration.model import WHITE_ACCELERATION, Calibration
@@ -153,6 +153,7 @@ def session_windows(context: FactorContext, span: tuple[int, int]) -> tuple[list
     aiding = {name: stream.t_ns for name, stream in streams.items()}
     epochs = [stream.available_ns if causal else stream.t_ns for stream in streams.values()] + [context.image_ns]
     times = keyframe_times(span, epochs, context.gaps, spacing, standing, causal=causal)
+    times = np.union1d(times, turn_times(times, context.bridged_imu))
     windows = make_windows(context.bridged_imu, times, context.gaps, aiding, spacing, rests.spans())
     return delayed.assign(windows, streams, merge) if causal else (windows, {})
 

@@ -30,6 +30,7 @@ from smartnav_graph.estimate.result.assemble import (
     used_counts,
 )
 from smartnav_graph.estimate.result.diagnostics import Diagnostics, Updates
+from smartnav_graph.estimate.result.heading import heading_known, with_unknown_heading
 from smartnav_graph.estimate.result.score_tests import unmodelled
 from smartnav_graph.estimate.result.summary import run_facts, summarise
 from smartnav_graph.estimate.reweight.outliers import position_builders
@@ -176,6 +177,12 @@ def _finish(
     looked_at = unmodelled(solved) if causal is None or "polish" in extra else None
     if looked_at is not None:
         keyframes = replace(keyframes, covariance=keyframes.covariance + looked_at.covariance())
+    known = heading_known(solved, initial.sigma_heading_deg)
+    if not known:
+        initial = initial.with_unknown_heading()
+        keyframes = replace(keyframes, covariance=with_unknown_heading(keyframes.covariance))
+        causal = None if causal is None else replace(causal, covariance=with_unknown_heading(causal.covariance))
+    extra = {"heading_known": known and not problem.positions_only, **extra}
     withheld = score_holdout(problem, keyframes, estimate)
     solution = resample(problem, keyframes)
     clock.lap("assemble")

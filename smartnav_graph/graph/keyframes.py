@@ -1,7 +1,7 @@
 """Measurements + config -> the windows between keyframes.
 
 Keyframes are at the union of aiding epochs, at borders of gaps and standstills, and nowhere further apart than a
-maximum spacing. Inertial data are cut at keyframes by linear interpolation.
+maximum spacing or turn. Inertial data are cut at keyframes by linear interpolation.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ NOWHERE: Times = np.zeros(0, dtype=np.int64)
 
 # Longest window inside a gap, s, or as a share of the gap: as fine as the error of what was not measured.
 GAP_SPACING_S, GAP_SHARE = 0.5, 0.05
+# Largest turn of a window, rad: the rotation vector that preintegration adds up is singular at a whole revolution.
+MOST_TURN = 0.5 * np.pi
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def keyframe_times(
     borders = [b for gap in gaps for b in (gap.start_ns, gap.end_ns)]
     aided = np.unique(np.concatenate([np.zeros(0, np.int64), *aiding]))
     aided = aided[(aided >= start) & (aided <= end)]
-    aided = aided[np.concatenate([[True], np.diff(aided) > merge])] if len(aided) else aided
+    aided = _apart(aided, merge)
     rest = np.unique(np.concatenate([np.array([start, end, *borders], dtype=np.int64), standstills]))
     rest = rest[(rest >= start) & (rest <= end)]
     if len(aided):
@@ -73,6 +75,17 @@ def keyframe_times(
         rest = rest[near > merge]
     fixed = np.union1d(aided, rest)
     return np.union1d(fixed, _fill(fixed, gaps, config.max_spacing_s, causal=causal))
+
+
+def _apart(times: Times, merge: int) -> Times:
+    """Those of increasing stamps that are further than `merge` ns from the last one kept."""
+    if not (np.diff(times) <= merge).any():
+        return times
+    kept = times[:1].tolist()
+    for stamp in times.tolist():
+        if stamp - kept[-1] > merge:
+            kept.append(stamp)
+    return np.array(kept, dtype=np.int64)
 
 
 def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float, *, causal: bool) -> Times:
@@ -90,6 +103,24 @@ def _fill(fixed: Times, gaps: Sequence[Gap], spacing_s: float, *, causal: bool) 
         if n > 1
     ]
     return np.concatenate([np.zeros(0, np.int64), *pieces])
+
+
+def turn_times(times: Times, imu: Imu) -> Times:
+    """Stamps (m,) of samples that part windows between `times` (n,) of more than `MOST_TURN`; one depends on earlier
+    samples only."""
+    step = 0.5 * np.diff(imu.t_ns)[:, None] / NS
+    turn = np.concatenate([np.zeros((1, 3)), np.cumsum(step * (imu.gyro[1:] + imu.gyro[:-1]), axis=0)])
+    edges, start = np.searchsorted(imu.t_ns, times), interpolate(times, imu.t_ns, turn)
+    window = np.repeat(np.arange(len(times) - 1), np.diff(edges))
+    wide = np.linalg.norm(turn[edges[0] : edges[-1]] - start[window], axis=1) > MOST_TURN
+    found: list[int] = []
+    for k in np.unique(window[wide]):
+        last, at = start[k], edges[k]
+        while len(over := np.flatnonzero(np.linalg.norm(turn[at : edges[k + 1]] - last, axis=1) > MOST_TURN)):
+            at += max(over[0] - 1, 0)
+            found.append(int(imu.t_ns[at]))
+            last, at = turn[at], at + 1
+    return np.array(found, dtype=np.int64)
 
 
 def inside(spans: Sequence[Gap], t_ns: Times) -> NDArray[np.bool_]:

@@ -13,10 +13,12 @@ from smartnav_graph.core.timebase import NS, Gap, ns_from_seconds
 from smartnav_graph.graph.keyframes import (
     GAP_SHARE,
     GAP_SPACING_S,
+    MOST_TURN,
     KeyframeConfig,
     inside,
     keyframe_times,
     make_windows,
+    turn_times,
 )
 from smartnav_graph.session.streams import Imu
 
@@ -48,6 +50,7 @@ def test_keyframes_are_the_union_of_ends_and_aiding_epochs():
 def test_two_streams_on_one_epoch_share_a_keyframe():
     assert times((0, 1), [(0.5,), (0.5, 0.50005)]) == [0, 0.5, 1]
     assert times((0, 1), [(0.5,), (0.5002,)]) == [0, 0.5, 0.5002, 1]
+    assert times((0, 1), [(0.5, 0.50006, 0.50015)]) == [0, 0.5, 0.50015, 1]  # near its neighbour, not near a keyframe
 
 
 def test_a_border_or_end_next_to_aiding_gives_way_to_it():
@@ -75,6 +78,35 @@ def test_aiding_and_borders_outside_the_span_are_left_out():
 
 def test_no_aiding_at_all():
     assert times((0, 2)) == [0, 1, 2]
+
+
+def turning(deg_s: float, hz: int = 1000, seconds: int = 4) -> Imu:
+    """At rest for half the time, then turning about x."""
+    t = np.arange(seconds * hz + 1) / hz
+    gyro = np.zeros((len(t), 3))
+    gyro[t > seconds / 2, 0] = np.radians(deg_s)
+    return Imu(t_ns=ns_from_seconds(t), gyro=gyro, accel=np.tile([0.0, 0.0, 9.81], (len(t), 1)))
+
+
+def test_no_window_turns_by_more_than_preintegration_can_take():
+    imu, plain = turning(500.0), ns(0, 1, 2, 3, 4)
+    found = np.union1d(plain, turn_times(plain, imu))
+    assert (found[found <= 2 * NS] == ns(0, 1, 2)).all()  # none where nothing turns
+    assert len(found) - len(plain) == 2 * (500 // 90)
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
+    for window in make_windows(imu, found, (), {}, SECOND)[1:]:
+        assert np.linalg.norm((window.gyro * window.dt[:, None]).sum(axis=0)) < 1.01 * MOST_TURN
+        pim = gtsam.PreintegratedCombinedMeasurements(params)
+        for force, rate, dt in zip(window.accel, window.gyro, window.dt.tolist(), strict=True):
+            pim.integrateMeasurement(force, rate, dt)
+        assert np.linalg.eigvalsh(pim.preintMeasCov())[0] > 0  # of one window of 1 s it has negative ones
+
+
+def test_a_keyframe_for_a_turn_depends_on_earlier_samples_only():
+    imu, plain = turning(500.0), ns(0, 1, 2, 3, 4)
+    found, early = turn_times(plain, imu), turn_times(plain, imu.take(imu.t_ns <= 3 * NS))[:1]
+    assert found[0] == early[0]
+    assert not len(turn_times(plain, turning(60.0)))  # a car
 
 
 @given(

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from smartnav_graph.core.errors import ConfigError
-from smartnav_graph.factors.prior import PriorBuilder
+from smartnav_graph.factors.prior import UNKNOWN_ANGLE, PriorBuilder
 from smartnav_graph.graph.pass_state import PassState
 
 
@@ -80,6 +80,12 @@ class InitialState:
         """The same with another sigma (deg) of its heading."""
         was, now = (f"deg +- {sigma:.1f} deg" for sigma in (self.sigma_heading_deg, min(sigma_deg, 180.0)))
         return replace(self, sentence=self.sentence.replace(was, now), sigma_heading_deg=min(sigma_deg, 180.0))
+
+    def with_unknown_heading(self) -> InitialState:
+        """The same with a heading that is not known."""
+        was = f"Heading {self.heading_deg:.1f} deg +- {self.sigma_heading_deg:.1f} deg found"
+        sentence = self.sentence.replace(was, "Heading unknown, not found")
+        return replace(self, sentence=sentence, sigma_heading_deg=float(np.degrees(UNKNOWN_ANGLE)))
 
     def to_dict(self) -> dict[str, Any]:
         """As in summary.json."""

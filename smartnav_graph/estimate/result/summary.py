@@ -57,6 +57,10 @@ def peak_memory_mb() -> float:
     return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
 
 
+HEADING_UNKNOWN = (
+    "heading: unknown, every heading fits the measurements; add a magnetometer or a part in which the speed or the "
+    "direction of travel changes, or give --initial"
+)
 POSITIONS_ONLY = "positions only"  # mode without inertial data; see `estimate.constant_velocity`
 
 
@@ -111,6 +115,8 @@ def summarise(
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused] + weight_text(pass_state)
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
+    if extra.get("heading_known") is False:
+        warnings.append(HEADING_UNKNOWN)
     summary: dict[str, Any] = {
         "verdict": verdict(VerdictInputs(solved, fit, withheld, together, looked_at)),
         "mode": mode,

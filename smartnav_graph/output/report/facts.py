@@ -75,11 +75,12 @@ def _processing(summary: Summary) -> str:
 
 def _accuracy(summary: Summary, uncertainty: Uncertainty | None) -> str:
     failed = "The solver did not converge: do not rely on this result. " * (summary.get("converged") is False)
+    unknown = " The heading is unknown." * (summary.get("heading_known") is False)
     if uncertainty is None:
-        return failed.strip()
+        return (failed + unknown).strip()
     return (
         f"{failed}Horizontal position, 1 sigma: median {metres(uncertainty.median_m)}, largest "
-        f"{metres(uncertainty.largest_m)} at t = {seconds(uncertainty.largest_at_s)}."
+        f"{metres(uncertainty.largest_m)} at t = {seconds(uncertainty.largest_at_s)}.{unknown}"
     )
 
 
