@@ -31,6 +31,8 @@ from smartnav_graph.smoothers.whole_graph import WholeGraph
 
 # First row and derivatives (m,) of the residuals of some factors.
 Derivatives = Sequence[tuple[int, Floats]]
+# Errors that the states are solved for at once: a column of a long recording has megabytes.
+BLOCK = 16
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class LinearPart:
 
 
 class Sensitivity(NamedTuple):
-    """Of k errors: information (k, k), score (k,), power (k,), the information were all states known, and change (s, k)
-    of all states."""
+    """Of k errors: information (k, k), score (k,), power (k,), the information were all states known, and change (s, m)
+    of all states by those asked for."""
 
     information: Floats
     score: Floats
@@ -108,21 +110,25 @@ class LinearSystem:
         A, _ = self._matrices
         return splu((A.T @ A).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
-    def sensitivity(self, errors: Sequence[Derivatives]) -> Sensitivity:
-        """Of errors that these derivatives of the residuals have."""
+    def sensitivity(self, errors: Sequence[Derivatives], moving: Sequence[int] = ()) -> Sensitivity:
+        """Of errors that these derivatives of the residuals have; the change of the states by those of `moving`."""
         (A, b), normal = self._matrices, self._normal
         rows = [np.arange(first, first + len(by)) for error in errors for first, by in error]
         columns = np.repeat(np.arange(len(errors)), [sum(len(by) for _, by in error) for error in errors])
         values = [by for error in errors for _, by in error]
         J = csc_array((np.concatenate(values), (np.concatenate(rows), columns)), shape=(len(b), len(errors)))
-        cross = (A.T @ J).toarray()
-        fitted = normal.solve(np.column_stack([cross, A.T @ b]))
-        information = (J.T @ J).toarray() - cross.T @ fitted[:, :-1]
-        score = J.T @ b - cross.T @ fitted[:, -1]
-        return Sensitivity(information, score, np.asarray((J**2).sum(axis=0)), -fitted[:, :-1])
+        cross, information = (A.T @ J).tocsc(), (J.T @ J).toarray()
+        score = J.T @ b - cross.T @ normal.solve(A.T @ b)
+        change, place = np.empty((A.shape[1], len(moving))), {k: i for i, k in enumerate(moving)}
+        for first in range(0, len(errors), BLOCK):
+            block = range(first, min(first + BLOCK, len(errors)))
+            fitted = normal.solve(cross[:, [*block]].toarray())
+            information[:, [*block]] -= cross.T @ fitted
+            change[:, [place[k] for k in block if k in place]] = -fitted[:, [k - first for k in block if k in place]]
+        return Sensitivity(information, score, np.asarray((J**2).sum(axis=0)), change)
 
     def keyframes(self, change: Floats) -> Floats:
-        """Of the change (s, k) of all states that of the keyframes (n, 15, k), as `Estimate.covariance`."""
+        """Of the change (s, m) of all states that of the keyframes (n, 15, m), as `Estimate.covariance`."""
         names = np.sort(np.array(list(self._linear.keys()), dtype=np.uint64))
         ends = np.cumsum(dims_of(names))
         found = []

@@ -56,6 +56,11 @@ def radians(session: Session) -> Session:
     return changed(bare, "gnss", lla=lla * [np.pi / 180, np.pi / 180, 1.0])
 
 
+def no_fixes(session: Session) -> Session:
+    bare = session.replace(control=None, pose_fixes=None, magnetometer=None)
+    return changed(bare, "gnss", lla=session.gnss.lla * [0.0, 0.0, 1.0])
+
+
 def frozen_receiver(session: Session) -> Session:
     lla = np.array(session.gnss.lla)
     lla[20:50] = lla[20]
@@ -169,6 +174,7 @@ FAULTS = [
     (CAR, clipped, "|accel| is 19.61 in", "larger range"),
     (CAR, exchanged, "and near it with latitude and longitude exchanged", "exchange lat_deg and lon_deg"),
     (CAR, radians, "they look like radians", "give degrees"),
+    (CAR, no_fixes, "gnss: latitude and longitude are 0 in all rows", "it has no positions"),
     (CAR, repeated_fixes, "rows repeat the fix before, at", "remove the rows without a new fix"),
     (CAR, no_heights, "gnss: height_m is zero in all rows", "holds no heights"),
     (

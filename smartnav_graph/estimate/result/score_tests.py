@@ -73,8 +73,8 @@ class SensorError:
 
 
 class Unmodelled(NamedTuple):
-    """Errors without a state, what the data say of them, the change (n, 15, k) of the keyframes by each, and the linear
-    system that shows it."""
+    """Errors without a state, what the data say of them, the change (n, 15, m) of the keyframes by each that has a
+    prior, and the linear system that shows it."""
 
     errors: Sequence[SensorError]
     found: Sensitivity
@@ -89,8 +89,7 @@ class Unmodelled(NamedTuple):
         prior = np.diag(sigma[own] ** 2) + np.outer(common, common) * (kind[own, None] == kind[own])
         left = np.linalg.solve(np.eye(len(own)) + prior @ self.found.information[np.ix_(own, own)], prior)
         middle = left @ self.found.score[own]
-        change = self.change[:, :, own]
-        added = change @ (left + np.outer(middle, middle)) @ change.transpose(0, 2, 1)
+        added = self.change @ (left + np.outer(middle, middle)) @ self.change.transpose(0, 2, 1)
         return np.asarray(0.5 * (added + added.transpose(0, 2, 1)))
 
 
@@ -102,7 +101,8 @@ def unmodelled(solved: SolvedProblem) -> Unmodelled | None:
     found += _of_stances(solved, parts)
     if not found:
         return None
-    sensitivity = linear.sensitivity([rows for _, rows in found])
+    own = [k for k, (error, _) in enumerate(found) if error.prior_sigma]
+    sensitivity = linear.sensitivity([rows for _, rows in found], own)
     return Unmodelled([error for error, _ in found], sensitivity, linear.keyframes(sensitivity.change), linear)
 
 

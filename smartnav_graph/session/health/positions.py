@@ -134,7 +134,10 @@ def _exchanged(facts: Facts) -> Iterator[Finding]:
                 else:
                     yield Finding(name, apart, "check lat_deg, lon_deg and [origin]")
     for name, lla in _geodetic(facts).items():
-        if np.abs(lla[:, 0]).max() < np.pi / 2 and np.abs(lla[:, 1]).max() < np.pi:
+        if not lla[:, :2].any():
+            text = "latitude and longitude are 0 in all rows, as receivers write them without a fix"
+            yield Finding(name, text, f"remove {name}: it has no positions", "error")
+        elif np.abs(lla[:, 0]).max() < np.pi / 2 and np.abs(lla[:, 1]).max() < np.pi:
             text = "latitudes and longitudes are all within pi of zero, where there is no land: they look like radians"
             yield Finding(name, text, "give degrees", "error")
 
