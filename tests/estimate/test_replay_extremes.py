@@ -34,7 +34,9 @@ def test_a_device_that_spins_at_500_deg_s_is_replayed(smoother):
     session = sn.Session(
         imu=Imu(t_ns=ns_from_seconds(t), gyro=gyro, accel=accel),
         gnss=GnssFix(
-            t_ns=ns_from_seconds(t[fixes]), enu=0.5 * rng.standard_normal((seconds, 3)), sigma=np.full((seconds, 3), 0.5)
+            t_ns=ns_from_seconds(t[fixes]),
+            enu=0.5 * rng.standard_normal((seconds, 3)),
+            sigma=np.full((seconds, 3), 0.5),
         ),
     )
     run = replay(session, configured(smoother))
