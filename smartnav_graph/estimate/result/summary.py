@@ -115,8 +115,7 @@ def summarise(
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused] + weight_text(pass_state)
     warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
-    if extra.get("heading_known") is False:
-        warnings.append(HEADING_UNKNOWN)
+    warnings += [HEADING_UNKNOWN] * (extra.get("heading_known") is False)
     summary: dict[str, Any] = {
         "verdict": verdict(VerdictInputs(solved, fit, withheld, together, looked_at)),
         "mode": mode,
