@@ -1,6 +1,7 @@
 """Benchmarks, each beside its baseline in the same run: CPU seconds after imports, a fresh process a measurement.
 
     scripts/benchmark [--only NAME] [--repeat 5] [--json FILE]
+    scripts/benchmark --scale [--only NAME]      long recordings, once each
 
 batch-37min       simulated drive of 37 min in memory -> solution with 15x15 covariances, self-calibration off (noise,
                   clock offset) and no vehicle constraint; baseline: scripts/bare_gtsam.py 37 imu (the same factor type)
@@ -21,6 +22,14 @@ allan-6h          overlapping Allan deviation of 6 axes, 6 h at 100 Hz; baseline
 recording-37min   run.rrd of the simulated drive of 37 min (222 000 inertial samples), with identity, layout and factor
                   graph; beside it the same with 2000 JPEG pictures; baseline: scripts/bare_recording.py, Rerun's own
                   send_columns of the same arrays
+
+With --scale: a session on disk to its run folder with report and recording, beside one of a quarter of the size. The
+ratio is 4 where time grows as the size does; the peak is that of the large one.
+
+scale-8h, scale-24h      simulated drives, 100 Hz, fixes at 1 Hz
+scale-400hz-2h           inertial samples at 400 Hz
+scale-20hz-1h            fixes at 20 Hz
+scale-10000-images       1000 s in a room without fixes, tracked points at 10 Hz
 """
 
 from __future__ import annotations
@@ -110,6 +119,9 @@ def measure(kind: str, path: str) -> None:
         return
     if kind == "allan":
         measure_allan()
+        return
+    if kind == "whole":
+        measure_whole(Path(path))
         return
     if kind.startswith("recording"):
         measure_recording(Path(path), with_pictures=kind.endswith("pictures"))
@@ -228,6 +240,25 @@ def measure_recording(path: Path, *, with_pictures: bool) -> None:
     print_result(cpu, detail)
 
 
+def measure_whole(path: Path) -> None:
+    """In the fresh process: a session on disk to its run folder."""
+    import rerun  # noqa: F401  imports are not measured
+
+    import smartnav_graph as sn
+    from smartnav_graph.estimate.run import smooth
+    from smartnav_graph.output.run_folder import write_run
+
+    begin = time.process_time()
+    session = sn.load(path)
+    run = smooth(session)
+    with tempfile.TemporaryDirectory() as folder:
+        write_run(run, Path(folder) / "run")
+        sizes = {file.name: round(file.stat().st_size / 1e6, 1) for file in (Path(folder) / "run").iterdir()}
+    seconds = time.process_time() - begin
+    detail = {"samples": len(session.require_imu()), "keyframes": run.summary["keyframes"]}
+    print_result(seconds, detail | {"report_mb": sizes["report.html"], "recording_mb": sizes["run.rrd"]})
+
+
 def pictured(session: Any, folder: Path, count: int) -> Any:
     """The session with textured JPEG pictures of 640 x 480 spread over it."""
     import cv2
@@ -281,6 +312,23 @@ def make_4hz_session(folder: Path) -> str:
     return str(path)
 
 
+def make_long(name: str, share: float, folder: Path) -> str:
+    """The session of a benchmark of `SCALE`, or this share of it."""
+    scenario, seconds, rate_hz, fixes_hz = SCALE[name]
+    path = folder / f"{name}-{share:g}"
+    code = (
+        "import sys, dataclasses, smartnav_graph as sn\n"
+        "from smartnav_graph.simulation import recording\n"
+        "from smartnav_graph.simulation.scenarios import find_scenario\n"
+        "found, seconds, recording.RATE_HZ = find_scenario(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])\n"
+        "gnss = found.gnss and dataclasses.replace(found.gnss, rate_hz=float(sys.argv[4]))\n"
+        "sn.save(dataclasses.replace(found, seconds=seconds, gnss=gnss)(0), sys.argv[5])"
+    )
+    arguments = [scenario, *map(str, (seconds * share, rate_hz, fixes_hz)), str(path)]
+    subprocess.run([sys.executable, "-c", code, *arguments], check=True)
+    return str(path)
+
+
 def make_run(session: str, folder: Path) -> str:
     """A run on disk, without report and recording."""
     path = folder / "run"
@@ -327,6 +375,9 @@ def jobs(name: str, folder: Path) -> tuple[Job, Job, dict[str, Job]]:
         return lambda: ours("vision", trolley), lambda: bare_vision_solve(trolley), {}
     if name == "two-view":
         return lambda: ours("two-view", "simulated"), bare_two_view, {}
+    if name in SCALE:
+        large, small = (make_long(name, share, folder) for share in (1.0, 0.25))
+        return lambda: ours("whole", large), lambda: ours("whole", small), {}
     if name == "allan-6h":
         return lambda: ours("allan", "simulated"), bare_allan, {}
     if name == "recording-37min":
@@ -360,11 +411,20 @@ NAMES = (
     *("batch-37min", "batch-37min-full", "batch-4hz-full", "batch-2h", "replay-fixed-lag"),
     *("vision-frontend", "two-view", "vision-solve", "recording-37min", "allan-6h"),
 )
+# Scenario, seconds, inertial samples and fixes a second.
+SCALE = {
+    "scale-8h": ("car-2h", 28800.0, 100, 1.0),
+    "scale-24h": ("car-2h", 86400.0, 100, 1.0),
+    "scale-400hz-2h": ("car-2h", 7200.0, 400, 1.0),
+    "scale-20hz-1h": ("car-2h", 3600.0, 100, 20.0),
+    "scale-10000-images": ("room-30s", 1000.0, 100, 0.0),
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", choices=NAMES, help="one of them; repeatable")
+    parser.add_argument("--only", action="append", choices=(*NAMES, *SCALE), help="one of them; repeatable")
+    parser.add_argument("--scale", action="store_true", help="long recordings instead, once each")
     parser.add_argument("--repeat", type=int, default=5, help="measurements each; the median counts")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--measure", nargs=2, metavar=("KIND", "SESSION"), help=argparse.SUPPRESS)
@@ -375,8 +435,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="smartnav-benchmark-") as folder:
         figures = []
         print(f"{'name':<18}{'seconds':>10}{'baseline':>10}{'ratio':>8}{'peak MB':>9}")
-        for name in options.only or NAMES:
-            figures.append(benchmark(name, max(options.repeat, 1), Path(folder)))
+        for name in options.only or (SCALE if options.scale else NAMES):
+            figures.append(benchmark(name, 1 if name in SCALE else max(options.repeat, 1), Path(folder)))
             f = figures[-1]
             print(
                 f"{name:<18}{f['seconds']:>10.4f}{f['baseline_seconds']:>10.4f}{f['ratio']:>8.2f}"

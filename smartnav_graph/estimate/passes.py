@@ -223,6 +223,7 @@ def solve_passes(
         if following is None:
             return estimate, pass_.pass_state, pass_.number
         pass_ = following
+        del smoother, estimate  # their matrices are large: no two at a time
 
 
 def may_be_last(pass_: Pass, builders: Iterable[Builder]) -> bool:

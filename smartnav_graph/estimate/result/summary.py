@@ -64,8 +64,8 @@ HEADING_UNKNOWN = (
 POSITIONS_ONLY = "positions only"  # mode without inertial data; see `estimate.constant_velocity`
 
 
-def _doubts(estimate: Estimate, mode: str, chi2: float) -> list[str]:
-    doubts = []
+def _doubts(estimate: Estimate, mode: str, chi2: float, extra: Mapping[str, Any]) -> list[str]:
+    doubts = [HEADING_UNKNOWN] * (extra.get("heading_known") is False)
     if mode not in ("batch", POSITIONS_ONLY):
         relative = mode.replace("dead-", "dead ")
         doubts.append(f"{relative}: no absolute position measurement, errors grow with time; add position fixes")
@@ -113,9 +113,8 @@ def summarise(
     # States that left a lag one after the other were never solved together: their misfit says nothing of the data.
     together = "polish" in extra or not str(extra.get("mode", "")).startswith("replay")
     refused = [one.refused for one in (seen, tracks) if one is not None and one.refused] + weight_text(pass_state)
-    warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0)]
+    warnings = [*problem.warnings, *refused, *_doubts(estimate, mode, chi2["overall"] if together else 0.0, extra)]
     warnings += refuted_text(problem.rests, pass_state, problem.session.t0_ns)
-    warnings += [HEADING_UNKNOWN] * (extra.get("heading_known") is False)
     summary: dict[str, Any] = {
         "verdict": verdict(VerdictInputs(solved, fit, withheld, together, looked_at)),
         "mode": mode,

@@ -5,7 +5,8 @@ Only this package imports rerun. Entities: /world (local ENU: est with its camer
 /status, /log, /report, /states; /camera and /tracks where no path or no calibration is known. Every row has the time
 lines `elapsed` (since the session's time zero), `utc` (clock is a date) or `device` (raw reading), and, where there is
 a solution, `keyframe`. Nothing in the file depends on when or how fast it was made; the latency of updates, which does,
-is a second recording that the viewer joins to the first (`write_latency`).
+is a second recording that the viewer joins to the first (`write_latency`). Signals of more than `signals.MOST_ROWS`
+rows are thinned: every row is in the Parquet files of the session, as used in imu.parquet of the run.
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ def _log_all(recorder: Recorder, shown: _Shown) -> rrb.Blueprint:
         factor = _log_scene(recorder, shown, extent, found)
         if extent.shift.any():
             notes.append("positions are drawn minus {:.0f}, {:.0f}, {:.0f} m east, north, up".format(*extent.shift))
-    signals.log_sensors(recorder, session, found.end_ns)
+    notes += signals.log_sensors(recorder, session, found.end_ns)
     if solution is not None:
         signals.log_motion(recorder, solution)
         signals.log_biases(recorder, solution, shown.evaluation)

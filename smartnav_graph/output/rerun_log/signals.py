@@ -22,6 +22,8 @@ UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_ut": "µT", "_hpa
 MARKER_SIZE = 2.0
 AXES = ("x", "y", "z", "east", "north", "up")
 MANY = 500
+# Rows of a signal beyond which the viewer is given the lowest and highest reading of each stretch alone.
+MOST_ROWS = 400_000
 EVALUATION_FIELDS = ("t_ns", "error_enu_m", "sigma_enu", "rotation_error_deg")
 
 
@@ -51,12 +53,30 @@ def signals_of(session: Session) -> list[Signal]:
     return found
 
 
-def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> None:
-    """The raw signals."""
-    for signal in signals_of(session):
+def lowest_and_highest(signal: Signal, most: int = MOST_ROWS) -> Signal:
+    """At most `most` rows of a signal: the first, the last, and the lowest and highest of each axis in each of many
+    stretches of equal numbers of rows, so that spikes remain."""
+    n, table = len(signal.t_ns), signal.values.reshape(len(signal.t_ns), -1)
+    if n <= most:
+        return signal
+    size = -(-n // (most // (2 * table.shape[1]) - 2))
+    blocks = table[: n // size * size].reshape(-1, size, table.shape[1])
+    first = np.arange(len(blocks))[:, None] * size
+    extremes = [first + find(np.nan_to_num(blocks), axis=1) for find in (np.argmin, np.argmax)]
+    kept = np.unique(np.concatenate([[0, n - 1], *(rows.ravel() for rows in extremes)]))
+    return signal._replace(t_ns=signal.t_ns[kept], values=signal.values[kept])
+
+
+def log_sensors(recorder: Recorder, session: Session, end_ns: int) -> list[str]:
+    """The raw signals; a note on those that are thinned."""
+    signals = signals_of(session)
+    long = [signal.path.removeprefix("/") for signal in signals if len(signal.t_ns) > MOST_ROWS]
+    for signal in map(lowest_and_highest, signals):
         names = ["x", "y", "z"] if signal.values.ndim == 2 else [signal.path.removeprefix("/")]
         _log_lines(recorder, signal.path, signal.t_ns, signal.values, names)
         recorder.clear(signal.path, stops(signal.t_ns, end_ns))
+    note = f"{', '.join(long)}: the lowest and highest reading of each stretch, every row is in the session"
+    return [note + " (of the inertial data also in imu.parquet of the run)"] if long else []
 
 
 def _log_lines(recorder: Recorder, path: str, t_ns: Times, values: Floats, names: list[str]) -> None:

@@ -14,6 +14,22 @@ from smartnav_graph.graph.solution import POS, Residuals
 from smartnav_graph.output.rerun_log import signals
 
 
+def test_a_long_signal_keeps_its_spikes_and_ends():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((100_003, 3))
+    values[[0, 77_777, 100_002], [0, 1, 2]] = 99.0, -99.0, 99.0
+    whole = signals.Signal("/imu/accel", "accel", np.arange(len(values)), values)
+    some = signals.lowest_and_highest(whole, 3000)
+    assert len(some.t_ns) <= 3000 and (np.diff(some.t_ns) > 0).all() and some.t_ns[[0, -1]].tolist() == [0, 100_002]
+    np.testing.assert_array_equal(some.values, values[some.t_ns])
+    assert (some.values.min(axis=0) == values.min(axis=0)).all() and (
+        some.values.max(axis=0) == values.max(axis=0)
+    ).all()
+    assert signals.lowest_and_highest(whole, len(values)) is whole
+    alone = signals.lowest_and_highest(signals.Signal("/pressure", "", whole.t_ns, values[:, 1]), 3000)
+    assert alone.values.min() == -99.0 and len(alone.t_ns) <= 3000
+
+
 def test_biases_and_errors_carry_their_variances(recording):
     solution = make_solution()
     enu, xyz = ("east", "north", "up"), ("x", "y", "z")
