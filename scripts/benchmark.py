@@ -29,7 +29,7 @@ ratio is 4 where time grows as the size does; the peak is that of the large one.
 scale-8h, scale-24h      simulated drives, 100 Hz, fixes at 1 Hz
 scale-400hz-2h           inertial samples at 400 Hz
 scale-20hz-1h            fixes at 20 Hz
-scale-10000-images       1000 s in a room without fixes, tracked points at 10 Hz
+scale-10000-images       1000 s indoors without fixes, tracked points at 10 Hz
 """
 
 from __future__ import annotations
