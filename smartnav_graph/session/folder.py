@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import tomli_w
 
 from smartnav_graph.core.arrays import Column
@@ -176,4 +177,5 @@ def load(path: str | Path, *, repairs: Iterable[str] = ()) -> Session:
         session = Session(path=folder, pictures=folder / PICTURES, dropped=dropped, **{**header, **streams})
     except SessionError as error:
         raise error.located(folder / f"{error.stream}.parquet" if error.stream else folder) from error
+    pa.default_memory_pool().release_unused()  # as much as the tables
     return in_right_units(session) if "units" in wanted else session

@@ -84,6 +84,7 @@ class _Fronts:
             raise columns.fault(int(columns.starts[~np.isin(columns.names, list(names))][0]))
         i, j, value = linear.sparseJacobian_()  # numbered from 1, columns in the order of the keys, right side last
         row, column = i.astype(np.intp) - 1, j.astype(np.intp) - 1
+        del i, j  # hundreds of megabytes of a long recording
         right = column == len(columns.group)
         self.residual = np.zeros(rows)
         self.residual[row[right]] = value[right]
