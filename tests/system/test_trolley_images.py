@@ -30,3 +30,14 @@ def test_better_by_two_and_never_worse_for_a_camera_that_is_not_known(seed):
     states = run.summary["states"]
     assert np.degrees(states["camera_boresight_rad"]["value"][1]) == pytest.approx(0.5, rel=0.1)
     assert states["images_time_offset_s"]["value"] == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_turns_on_the_spot_between_long_corridors(seed):
+    """Neighbours only, half of them without a baseline: images help less, and never harm."""
+    session = SCENARIOS["trolley-20min-plain"](seed)
+    blind = sn.Config(image_pairs=CoplanarityConfig(enabled=False))
+    without = rms(session, sn.run(session, blind, rate="imu").solution)
+    metres, degrees = rms(session, sn.run(session, rate="imu").solution)
+    assert metres < without[0] and degrees < without[1]
