@@ -79,7 +79,7 @@ def covered(seeds):
         values = fit(plate(seed), AxesOptions()).values
         for sensor in ("gyro", "accel"):
             for axis, true in zip("xyz", np.degrees(ANGLES), strict=True):
-                count.add(f"{sensor}_angle_{axis}", values[f"{sensor}_angle_{axis}"], true)
+                count.add(f"{sensor} angle", values[f"{sensor}_angle_{axis}"], true)
     return count
 
 

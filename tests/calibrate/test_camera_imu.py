@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated import Coverage
 
 import smartnav_graph as sn
 from smartnav_graph.calibrate import calibrate_into
@@ -26,6 +27,18 @@ def recorded(seed=0, readout_s=0.0, turn=TURN, clock_s=0.04, count=(120, 160)):
     session = replace(ROOM, camera=model)(seed)
     known = replace(session.calibration, cameras={"cam0": replace(camera, readout_s=0.0)})
     return session.replace(calibration=known)
+
+
+def covered(seeds):
+    count = Coverage()
+    for seed in seeds:
+        session = recorded(seed)
+        values = fit([session], CameraImuOptions()).values
+        count.add("clock", values["cam0_time_offset"], 0.04)
+        for axis, turn, place in zip("xyz", TURN, session.mount("cam0").body_t, strict=True):
+            count.add("turn", values[f"cam0_turn_from_mount_{axis}"], turn)
+            count.add("position", values[f"cam0_position_{axis}"], place)
+    return count
 
 
 @pytest.fixture(scope="module")

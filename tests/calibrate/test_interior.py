@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boards import PHONE, exact_views, noisy, poses, theta_of
+from simulated import Coverage
 
 from smartnav_graph.calibrate.interior import MODELS, BoardView, calibrate_camera, project_board
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.session.calibration.camera import Camera
+from smartnav_graph.session.calibration.pieces import Value
 
 SIZE = (PHONE.width, PHONE.height)
 WIDE = replace(PHONE, model="fisheye", fx=350.0, fy=351.0, distortion=(0.05, -0.02, 0.01, -0.003))
@@ -35,6 +37,17 @@ def test_derivatives(model):
         step[i] = 1e-6
         moved, _, _ = project_board(model, theta + step[: len(theta)], pose + step[len(theta) :], points)
         assert np.allclose((moved - xy).ravel() / 1e-6, column, rtol=1e-3, atol=1e-3)
+
+
+def covered(seeds, views=12):
+    """By parameter."""
+    count = Coverage()
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        found = calibrate_camera(noisy(exact_views(poses(views, rng)), 0.2, rng), SIZE)
+        for name, value, sigma, true in zip(found.names, found.theta, found.sigmas, theta_of(PHONE), strict=True):
+            count.add(name, Value(value, sigma, ""), true)
+    return count
 
 
 def deviations(seeds, views=12, sigma=0.2, smooth=0.0):
