@@ -15,7 +15,7 @@ def eliminated(J: Floats, own: Floats, residual: Floats, weight: Floats, prior: 
     """Information (n, p, p) and scores (n, p) of common unknowns.
 
     J (n, k, p), own (n, k, q) : derivatives of residuals (n, k) by common unknowns and by those of each pair
-    weight (n, k) ; prior (q, q) : information on those of a pair
+    weight (n, k) ; prior (q, q) or (n, q, q) : information on those of a pair
     """
     weighted, weighted_own = J * weight[..., None], own * weight[..., None]
     B = np.swapaxes(weighted, 1, 2) @ own

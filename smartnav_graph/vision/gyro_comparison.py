@@ -29,6 +29,7 @@ from smartnav_graph.session.calibration.camera import Camera
 from smartnav_graph.session.health.facts import Finding
 from smartnav_graph.session.session import Mount
 from smartnav_graph.session.streams import Imu
+from smartnav_graph.vision.elimination import eliminated
 from smartnav_graph.vision.epipolar import sampson
 from smartnav_graph.vision.gating import Geometry
 from smartnav_graph.vision.pairs import Pairs
@@ -301,13 +302,8 @@ class _Problem(NamedTuple):
         white = missed.residual / sigma
         beyond = (white / LOSS_SCALE) ** 2  # Cauchy loss
         weight, cost = there / (1.0 + beyond), 0.5 * LOSS_SCALE**2 * np.log1p(beyond)
-        J = np.concatenate([missed.by_rotation @ by, missed.by_translation @ across(t)], axis=2) / sigma
-        weighted = (J * weight[..., None]).transpose(0, 2, 1)
-        H, g = weighted @ J, (weighted @ white[..., None])[..., 0]
-        own = H[:, 7:, 7:]
-        inner = np.linalg.inv(own + 1e-9 * (1.0 + np.trace(own, axis1=1, axis2=2))[:, None, None] * np.eye(2))
-        carried = H[:, :7, 7:] @ inner
-        normal = H[:, :7, :7] - carried @ H[:, 7:, :7]
-        right = g[:, :7] - (carried @ g[:, 7:, None])[:, :, 0]
+        J, own = missed.by_rotation @ by / sigma, missed.by_translation @ across(t) / sigma
+        least = 1e-9 * (1.0 + np.einsum("nka,nk,nka->n", own, weight, own))  # of a pair without parallax
+        normal, scores = eliminated(J, own, white, weight, least[:, None, None] * np.eye(2))
         sound = ((np.abs(white) < 4.0) & there).sum(axis=1) >= 0.5 * pairs.count
-        return _Rotations((cost * there).sum(axis=1), normal, right, sound)
+        return _Rotations((cost * there).sum(axis=1), normal, -scores, sound)
