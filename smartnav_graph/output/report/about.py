@@ -73,7 +73,7 @@ def facts_of(session: Session, solution: Solution, summary: Summary, config: Con
         *_dates(session, solution, zone),
         ("Coordinates", _coordinates(solution, "" if config is None else config.report.crs)),
         ("Heights", _heights(session, solution)),
-        ("Device", _device(session)),
+        ("Device", _device(session, "" if config is None else config.run.vehicle)),
         ("Measurements used", _used(summary)),
         ("Session", [str(session.path)] if session.path else []),
         ("Processing", [text_of(summary, "mode")] if text_of(summary, "mode") else []),
@@ -122,9 +122,10 @@ def _heights(session: Session, solution: Solution) -> list[str]:
     return lines
 
 
-def _device(session: Session) -> list[str]:
-    device = session.device
-    lines = [device.name, f"forward {device.forward}, up {device.up}; carried by: {device.vehicle}"]
+def _device(session: Session, vehicle: str) -> list[str]:
+    device, vehicle = session.device, vehicle or session.device.vehicle
+    carried = "" if vehicle == "none" else f"; carried by: {vehicle}"
+    lines = [device.name, f"forward {device.forward}, up {device.up}{carried}"]
     if session.calibration is not None and session.calibration.device not in ("", "unknown", device.name):
         lines.append(f"calibration: {session.calibration.device}")
     return lines
