@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from smartnav_graph.cli import progress as shown
 from smartnav_graph.core.progress import under, watched
+from smartnav_graph.output import progress as shown
 
 
 def collected():
