@@ -59,7 +59,7 @@ def test_a_factor_of_another_package_changes_the_result_and_has_its_chi_square(i
 
 def test_its_options_and_its_reader_are_listed(installed):
     shown = call(installed, "config", "--help-all").stdout
-    assert "[level_floor]" in shown and re.search(r"--level-floor\.sigma-m\s+of that height, m", shown)
+    assert "[level_floor]" in shown and re.search(r"--level-floor\.sigma-m M\s+Of that height, m", shown)
     assert "tinylog" in call(installed, "formats").stdout
     lines = [f"tinylog {100 + i / 100:.2f} 0.01 0 0 0 0 9.81" for i in range(300)]
     (installed / "walk.txt").write_text("\n".join(lines))
