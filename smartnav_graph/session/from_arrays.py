@@ -147,6 +147,9 @@ def _refuse_other_names(kind: type[Stream], table: Table, unknown: list[str]) ->
             near = {name: close[0] for name in missing if (close := difflib.get_close_matches(name, unknown, 1, 0.6))}
             hint = "; ".join(f"is {given} meant for {name}? then convert its unit" for name, given in near.items())
             fields = f"columns {', '.join(names)}" + (f", or {spec.name} (n, {len(names)})" if len(names) > 1 else "")
+            if {"height_m", "u_m"} & set(missing) and len(missing) == 1:
+                hint = f"add {missing[0]}, NaN where the height is not known"
+            hint = hint or (f"rename {', '.join(unknown)}" if unknown else "add them")
             raise SessionError(kind.NAME, f"{', '.join(missing)} missing", fields, hint, stream=kind.NAME)
 
 

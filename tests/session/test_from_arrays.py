@@ -102,6 +102,10 @@ def test_the_first_fix_is_the_origin():
 def test_names_that_are_missing_or_unknown(warned):
     with pytest.raises(sn.SmartnavError, match=r"accel_x_m_s2.* missing; .*is accel_x_g meant for accel_x_m_s2"):
         sn.Session.from_pandas(imu=frame().rename(columns={"accel_x_m_s2": "accel_x_g"}))
+    with pytest.raises(sn.SmartnavError, match=r"gyro_x_rad_s.* missing; .*; rename wx, wy"):
+        sn.Session.from_arrays(imu={"time": T_NS, "wx": GYRO[:, 0], "wy": GYRO[:, 1]})
+    with pytest.raises(sn.SmartnavError, match=r"height_m missing; .*NaN where the height is not known"):
+        session(T_NS, gnss={"time": T_NS[:1], "lat_deg": [48.0], "lon_deg": [11.0]})
     sn.Session.from_pandas(imu=frame(lux=1.0))
     assert warned() == "imu: unknown column lux; kept, but not used"
     with pytest.raises(TypeError, match="no stream 'gps'; expected some of imu, gnss"):
