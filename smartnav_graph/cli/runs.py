@@ -125,8 +125,8 @@ class Export(Writing):
         Literal["tum", "kml", "geojson", "gpx", "csv", "sbet", "nmea", "gpkg", "images", "smartnav"],
         tyro.conf.arg(metavar="FORMAT"),
     ]
-    """One of tum, kml, geojson, gpx, csv, sbet, nmea, gpkg, images, smartnav (files of the logger of 2012). All but tum,
-    csv and smartnav need an origin, sbet and nmea a clock with dates."""
+    """One of tum, kml, geojson, gpx, csv, sbet, nmea, gpkg, images, smartnav (files of the logger of 2012). All but
+    tum, csv and smartnav need an origin, sbet and nmea a clock with dates."""
     crs: Annotated[str | None, tyro.conf.arg(metavar="EPSG:CODE")] = None
     """For csv and gpkg: coordinates in this system, too, such as EPSG:25832."""
     solution: Literal["smoothed", "causal"] = "smoothed"
