@@ -153,6 +153,8 @@ def make_camera_model(
     degrees = camera.boresight_sigma_deg if boresight_sigma_deg is None else boresight_sigma_deg
     seconds = camera.time_offset_sigma_s if time_offset_sigma is None else time_offset_sigma
     focal = camera.focal_sigma if focal_sigma is None else focal_sigma
+    if context.causal:  # before scale and heading are known it would take their errors
+        focal = 0.0
     body_R, body_t = np.array(mount.body_R, dtype=np.float64), np.array(mount.body_t, dtype=np.float64)
     expected_boresight, seen = np.zeros(3), context.camera_turns
     if seen is not None and context.camera_offset_s and seconds > 0:
