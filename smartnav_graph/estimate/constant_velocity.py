@@ -21,7 +21,6 @@ import numpy as np
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.notes import Notes, PreparationStep
 from smartnav_graph.estimate.preparation import PREPARE
-from smartnav_graph.session import health
 from smartnav_graph.session.calibration.model import WHITE_ACCELERATION, Calibration
 from smartnav_graph.session.session import Device, Mount, Session
 from smartnav_graph.session.streams import POSITIONS, Imu
@@ -59,19 +58,9 @@ def constant_velocity(session: Session, notes: Notes) -> Session:
     )
 
 
-def check_positions(session: Session, notes: Notes) -> Session:
-    """As `preparation.check_health`; there are no inertial data to compare clocks with."""
-    checked = health.inspect(session, ())
-    checked.raise_errors()
-    notes.warnings += checked.warnings()
-    notes.findings = [*notes.findings, *(found for found in checked.findings if found.level == "warning")]
-    return session
-
-
 # As `preparation.PREPARE`, of a session without inertial data.
 PREPARE_POSITIONS: Mapping[str, PreparationStep] = {
-    "health": check_positions,
-    "sensors": PREPARE["sensors"],
+    **{name: PREPARE[name] for name in ("health", "sensors")},
     "model": constant_velocity,
     **{name: PREPARE[name] for name in ("span", "reach", "latency", "holdout", "sigmas", "outside", "lead")},
 }

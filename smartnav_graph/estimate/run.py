@@ -174,7 +174,8 @@ def _finish(
     problem, estimate, pass_state = solved.problem, solved.estimate, solved.pass_state
     keyframes = to_solution(solved)
     # States that left a lag one after the other were never solved together: their residuals say nothing of the data.
-    looked_at = unmodelled(solved) if causal is None or "polish" in extra else None
+    together = causal is None or "polish" in extra
+    looked_at = unmodelled(solved) if together and not problem.positions_only else None
     if looked_at is not None:
         keyframes = replace(keyframes, covariance=keyframes.covariance + looked_at.covariance())
     known = heading_known(solved, initial.sigma_heading_deg)
