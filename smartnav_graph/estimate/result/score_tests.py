@@ -55,8 +55,8 @@ class SensorError:
     """An error of `sensor` with its sigma. kind : ``clock`` and, from t_ns on, ``clock jump`` (s, to be added to its
     stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale``, ``gyro
     scale`` and ``stance velocity`` of a foot (m/s) along the body axis `axis`; ``g-sensitivity`` of the gyro axis by
-    the force along another, rad/s / (m/s^2); ``focal length`` (relative); ``offset`` (m) of its positions to the east,
-    north or up.
+    the force along another, rad/s / (m/s^2); ``focal length`` (relative); of its positions to the east, north or up
+    ``offset`` (m), ``drift`` (m/s) and ``stretch`` (relative).
 
     prior_sigma : of what devices of the class have, zero where it is not in the covariance; shows : whether the data
     can say of it
@@ -125,7 +125,8 @@ def sensor_errors(looked_at: Unmodelled | None) -> list[SensorError]:
 
 def _of_positions(solved: SolvedProblem, linear: LinearSystem) -> Iterator[tuple[SensorError, Derivatives]]:
     estimate = solved.estimate
-    R, _, v, _ = estimate.states()
+    R, p, v, _ = estimate.states()
+    middle = p.mean(axis=0)
     for sensor in solved.fixes:
         rows = linear.at_poses(sensor)
         if len(rows) < LEAST_FIXES:
@@ -137,11 +138,16 @@ def _of_positions(solved: SolvedProblem, linear: LinearSystem) -> Iterator[tuple
         yield SensorError(sensor, "clock rate"), [(row, t * by) for t, (row, by) in zip(since, moved, strict=True)]
         for first in sorted({n * len(rows) // PARTS for n in range(1, PARTS)} - {0}):
             yield SensorError(sensor, "clock jump", t_ns=rows[first][0].name.t_ns), moved[first:]
-        for axis in range(3):
+        for axis, name in enumerate(("east", "north", "up")):
             yield SensorError(sensor, "lever arm", "xyz"[axis]), [(part.row, W[:, axis]) for part, W, _ in rows]
+            shifted = [(part.row, W @ R[k].T[:, axis]) for part, W, k in rows]
             if len(solved.fixes) > 1:
-                shifted = [(part.row, W @ R[k].T[:, axis]) for part, W, k in rows]
-                yield SensorError(sensor, "offset", ("east", "north", "up")[axis]), shifted
+                yield SensorError(sensor, "offset", name), shifted
+            yield SensorError(sensor, "drift", name), [(row, t * by) for t, (row, by) in zip(since, shifted, strict=True)]
+            if name != "up":
+                from_middle = [p[k, axis] - middle[axis] for _, _, k in rows]
+                stretched = [(row, d * by) for d, (row, by) in zip(from_middle, shifted, strict=True)]
+                yield SensorError(sensor, "stretch", name), stretched
 
 
 def _of_inertial_data(solved: SolvedProblem, parts: Sequence[LinearPart]) -> Iterator[tuple[SensorError, Derivatives]]:

@@ -95,6 +95,12 @@ LIMITS = {
     "offset": Limit(
         2.0, 5.0, "positions lie {value:+.1f} m {axis} of the other sensors", "bring all positions to one datum"
     ),
+    "drift": Limit(
+        0.1, 5.0, "positions drift {value:+.2f} m/s {axis} against the other sensors", "look what its positions come from"
+    ),
+    "stretch": Limit(
+        0.05, 5.0, "positions {axis} are {percent:+.0f} % too far apart", "check units and projection of its positions"
+    ),
     "focal length": Limit(0.015, 5.0, "the motion fits a focal length {percent:+.1f} % longer", "calibrate the camera"),
     "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
 }
