@@ -1,10 +1,11 @@
 """Errors of sensors that have no state: how large each would be if it had one, by the residuals of the solution, and
 how far they may move it (`smoothers.sensitivity`).
 
-Tested one by one are the clock offset of each position sensor, its rate, a jump of it, the lever arm, scale factors of
-accelerometer and gyroscope, and the focal length of a camera that has no state for it; where several sensors measure
-the position, an offset of each to the others. Errors that a class of devices has, and no state takes, are in the
-covariance (consider covariance): with their prior D, information I and score s by the data,
+Tested one by one are the clock offset of each position sensor, its rate, a jump of it, the lever arm, a stretch of its
+positions along east and north; where several sensors measure the position, an offset of each to the others; scale
+factors of accelerometer and gyroscope, and the focal length of a camera that has no state for it. Errors that a class
+of devices has, and no state takes, are in the covariance (consider covariance): with their prior D, information I and
+score s by the data,
 
     m = C s      C = (I + D^-1)^-1      P <- P + S (C + m m^T) S^T
 
@@ -56,7 +57,7 @@ class SensorError:
     stamps), ``clock rate`` (s/s, of the time since the middle); ``lever arm`` (m), ``accelerometer scale``, ``gyro
     scale`` and ``stance velocity`` of a foot (m/s) along the body axis `axis`; ``g-sensitivity`` of the gyro axis by
     the force along another, rad/s / (m/s^2); ``focal length`` (relative); of its positions to the east, north or up
-    ``offset`` (m), ``drift`` (m/s) and ``stretch`` (relative).
+    ``offset`` (m) and ``stretch`` (relative).
 
     prior_sigma : of what devices of the class have, zero where it is not in the covariance; shows : whether the data
     can say of it
@@ -143,7 +144,6 @@ def _of_positions(solved: SolvedProblem, linear: LinearSystem) -> Iterator[tuple
             shifted = [(part.row, W @ R[k].T[:, axis]) for part, W, k in rows]
             if len(solved.fixes) > 1:
                 yield SensorError(sensor, "offset", name), shifted
-            yield SensorError(sensor, "drift", name), [(row, t * by) for t, (row, by) in zip(since, shifted, strict=True)]
             if name != "up":
                 from_middle = [p[k, axis] - middle[axis] for _, _, k in rows]
                 stretched = [(row, d * by) for d, (row, by) in zip(from_middle, shifted, strict=True)]

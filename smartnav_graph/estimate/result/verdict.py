@@ -95,9 +95,6 @@ LIMITS = {
     "offset": Limit(
         2.0, 5.0, "positions lie {value:+.1f} m {axis} of the other sensors", "bring all positions to one datum"
     ),
-    "drift": Limit(
-        0.1, 5.0, "positions drift {value:+.2f} m/s {axis} against the other sensors", "look what its positions come from"
-    ),
     "stretch": Limit(
         0.05, 5.0, "positions {axis} are {percent:+.0f} % too far apart", "check units and projection of its positions"
     ),

@@ -42,8 +42,9 @@ MOST = 5.0
 WIDEST, WIDEST_OF_SAMPLES = 10.0, 5.0
 # Factor on either beyond which something else may be what makes the noise appear so.
 WORSE = 2.5
-# Share of the largest scale from which it is reached.
-AT_MOST = 0.99
+# Share of the largest scale from which it is reached, and the normalised square of fixes beside it that white noise
+# does not explain.
+AT_MOST, UNEXPLAINED = 0.99, 4.0
 # Normalised square at which fixes contradict their sigma.
 CONTRADICTION = 2.0
 # A group of less redundancy is estimated all the same where noise as assumed has so large a square this rarely.
@@ -216,11 +217,12 @@ def _most(own: float) -> float:
     return max(WIDEST, WIDEST_OF_SAMPLES * own)
 
 
-def worse_than_class(builder: ImuBuilder, pass_state: PassState) -> dict[str, float]:
-    """Scales of the white inertial noise found, where they are beyond its class and what the samples show, or as large
-    as they may become."""
+def worse_than_class(builder: ImuBuilder, pass_state: PassState, fixes_square: float = 1.0) -> dict[str, float]:
+    """Scales of the white inertial noise found, where they are beyond its class and what the samples show; beside
+    fixes of so large a normalised square that noise does not explain it, where they are as large as they may be."""
+    share = AT_MOST if fixes_square > UNEXPLAINED else np.inf
     return {
         name: pass_state.scale(name)
         for name, own in builder.sampling_scales().items()
-        if pass_state.scale(name) > min(WORSE * max(1.0, WIDEST_OF_SAMPLES * own), AT_MOST * _most(own))
+        if pass_state.scale(name) > min(WORSE * max(1.0, WIDEST_OF_SAMPLES * own), share * _most(own))
     }

@@ -12,7 +12,7 @@ without it; session states that the data do not determine are held at their cali
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -136,13 +136,15 @@ def _update_noise_and_fixes(
         new = replace(new, rejected=outliers)
     names = [name for builder, _ in found.values() for name in (*builder.noise_names, builder.stated_name)]
     change = max((abs(np.log(new.scale(name) / pass_state.scale(name))) for name in names), default=0.0)
-    new, calm = _inertial(builders, windows, estimate, pass_state, new, _level(found, pass_state))
+    stated = _square_per_redundancy(found, pass_state, lambda builder: builder.own_sigma)
+    new, calm = _inertial(builders, windows, estimate, pass_state, new, stated)
     if new.rejected != pass_state.rejected:
         return new, False
     settled = calm and change < STEADY
     if not (settled or (new.stage < LAST_STAGE and change < CLOSE)):
         return new, False
-    grown = enable_second_stage(builders, estimate, new)
+    square = _square_per_redundancy(found, pass_state, lambda builder: np.ones_like(builder.own_sigma))
+    grown = enable_second_stage(builders, estimate, new, square)
     return (grown, grown == new) if settled or grown.stage > new.stage else (new, False)
 
 
@@ -203,11 +205,15 @@ def extra_passes(builders: Iterable[Builder]) -> int:
     return GRADUATED_PASSES * also_gnc + ROUNDS * (one_of(builders, SmartBuilder) is not None)
 
 
-def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_state: PassState) -> PassState:
-    """The pass state with what joins once the trajectory is found; session states that are not observable are fixed."""
+def enable_second_stage(
+    builders: Sequence[Builder], estimate: Estimate, pass_state: PassState, fixes_square: float
+) -> PassState:
+    """The pass state with what joins once the trajectory is found, with fixes of this normalised square; session states
+    that are not observable are fixed."""
     positions = position_builders(builders)
     imu = one_of(builders, ImuBuilder)
-    doubtful = imu is not None and pass_state.stage == LAST_STAGE and bool(worse_than_class(imu, pass_state))
+    worse = {} if imu is None else worse_than_class(imu, pass_state, fixes_square)
+    doubtful = pass_state.stage == LAST_STAGE and bool(worse)
     correlated = frozenset(b.name for b in positions if b.has_correlated_error(pass_state, doubtful=doubtful))
     if pass_state.stage < LAST_STAGE:
         later = any(b.has_second_stage(pass_state) for b in builders)
@@ -223,11 +229,15 @@ def enable_second_stage(builders: Sequence[Builder], estimate: Estimate, pass_st
     return replace(pass_state, fixed_states={**pass_state.fixed_states, **blind}, correlated=correlated)
 
 
-def _level(found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState) -> float:
-    """Normalised square of the fixes in use with sigmas of their own over their redundancy, at least 1."""
+def _square_per_redundancy(
+    found: Mapping[str, tuple[PositionBuilder, FixResiduals]],
+    pass_state: PassState,
+    of: Callable[[PositionBuilder], Mask],
+) -> float:
+    """Normalised square of the fixes in use, of those rows, over their redundancy, at least 1."""
     square = redundancy = 0.0
     for name, (builder, one) in found.items():
-        used = pass_state.used(name, one.rows) & builder.own_sigma[one.rows]
+        used = pass_state.used(name, one.rows) & of(builder)[one.rows]
         square += float(one.square[used].sum())
         redundancy += float(one.redundancy[used].sum())
     return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0

@@ -45,6 +45,8 @@ BY_CHANCE = 1.0
 # Readings of a speed that are taken together, at least and for this time (s), all within the longest; the sigma (m/s)
 # of those without one.
 LEAST_READINGS, READINGS_S, LONGEST_S, SPEED_SIGMA = 3, 1.0, 5.0, 0.05
+# Of these, at least so many are in the standstill itself, where it has so many.
+LEAST_INSIDE = 2
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def find_moving(
         for name, fixes in positions.items():
             found += (replace(one, sensor=name) for one in fixes.moving(begin, end, from_ns))
     for name, readings in _speeds(session, noise).items():
-        found += (replace(one, sensor=name) for one in readings.moving() if rests.share(one.start_ns, one.end_ns) > 0.0)
+        for begin, end in stretches:
+            found += (replace(one, sensor=name) for one in readings.moving(begin, end))
     # only where the gyroscope shows no turn: turns move the points too
     found += [one for one in images if any(one.start_ns < b and one.end_ns > a for a, b in at_rest)]
     return found if from_ns is not None else [*found, *_remains(rests, stretches, found)]
@@ -233,17 +236,23 @@ class _Speeds:
     v: Floats
     sigma: Floats
 
-    def moving(self) -> Iterator[Moving]:
-        """Where the median of some readings is a significant speed, from a second before it is known."""
+    def moving(self, begin: int, end: int) -> Iterator[Moving]:
+        """Where the median of some readings is a significant speed, from a second before it is known, and some of them
+        lie in the standstill from `begin` to `end`: a device may stop between two readings."""
+        inside = (self.t_ns >= begin) & (self.t_ns <= end)
+        needed = min(LEAST_INSIDE, int(inside.sum()))
         later = np.append(self.t_ns[1:], self.t_ns[-1] + round(READINGS_S * NS))
-        for k in range(LEAST_READINGS - 1, len(self.t_ns)):
+        after = int(np.searchsorted(self.t_ns, end + LONGEST_S * NS, side="right"))
+        for k in range(max(LEAST_READINGS - 1, int(np.searchsorted(self.t_ns, begin)) - 1), after):
             first = min(k + 1 - LEAST_READINGS, int(np.searchsorted(self.t_ns, self.t_ns[k] - READINGS_S * NS)))
-            if self.t_ns[k] - self.t_ns[first] > LONGEST_S * NS:
+            if self.t_ns[k] - self.t_ns[first] > LONGEST_S * NS or inside[first : k + 1].sum() < needed:
                 continue
             speed = float(np.linalg.norm(np.median(self.v[first : k + 1], axis=0)))
             if speed > max(LEAST_SPEED, SIGNIFICANT * float(np.median(self.sigma[first : k + 1]))):
                 until = min(int(later[k]), int(self.t_ns[k] + READINGS_S * NS))
-                yield Moving("", int(self.available_ns[k] - READINGS_S * NS), until, speed)
+                start = int(self.available_ns[k] - READINGS_S * NS)
+                if start < end and until > begin:
+                    yield Moving("", start, until, speed)
 
 
 def _speeds(session: Session, noise: GnssNoise) -> dict[str, _Speeds]:

@@ -53,7 +53,7 @@ def found(monkeypatch):
 
 def test_none_is_significant_where_there_is_none(eight, found):
     errors = found(eight)
-    of_fixes = {"clock", "clock rate", "lever arm", "drift", "stretch"}
+    of_fixes = {"clock", "clock rate", "lever arm", "stretch"}
     assert {kind for kind, _ in errors} == of_fixes | {"accelerometer scale", "gyro scale"}
     assert all(abs(error.value) < 4.0 * error.sigma for error in errors.values())
 
@@ -77,13 +77,6 @@ def test_a_clock_at_another_rate(eight, found):
 def test_a_wrong_lever_arm(eight, found):
     wrong = eight.replace(sensors={"gnss": Mount(body_t=(-1.0, 0.0, 0.0))})
     assert_near(found(wrong)["lever arm", "x"], 1.0)  # m
-
-
-def test_positions_that_drift(eight, found):
-    """The rests show it."""
-    error = 0.3 * np.multiply.outer((eight.gnss.t_ns - eight.gnss.t_ns[0]) / 1e9, [1.0, 0.0, 0.0])
-    drifting = with_gnss(eight, lla=eight.frame.lla_from_nav(eight.nav_position(eight.gnss) + error))
-    assert_near(found(drifting)["drift", "east"], 0.3)  # m/s
 
 
 def test_positions_of_another_scale_along_one_axis(eight, found):

@@ -130,6 +130,14 @@ def test_noise_is_worse_than_its_class_only_beyond_what_the_samples_show():
     assert not worse_than_class(quiet, PassState(noise_scales={"accel": 1.5, "gyro_walk": 9.0}))
 
 
+def test_noise_at_its_bound_is_worse_than_its_class_where_it_does_not_explain_the_fixes():
+    shaken = ImuBuilder(KNOWN, 9.81, sampling_noise=(2.5 * KNOWN.accel_noise_density, 0.0))
+    largest = PassState(noise_scales={"accel": 12.5})  # five times what the samples show
+    assert worse_than_class(shaken, largest, fixes_square=9.0) == {"accel": 12.5}
+    assert not worse_than_class(shaken, largest, fixes_square=2.0)
+    assert not worse_than_class(shaken, PassState(noise_scales={"accel": 11.0}), fixes_square=9.0)
+
+
 # --- the statistics ---------------------------------------------------------------------------------------------------
 
 

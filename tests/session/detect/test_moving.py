@@ -125,3 +125,16 @@ def test_images_show_motion_where_nearly_all_points_move(share, moves):
     assert moving_spans(pairs, rest).tolist() == ([[0, NS]] if moves else [])
     begun = [(NS // 2, 2 * NS)]  # the first image was taken before the standstill
     assert not len(moving_spans(pairs, begun)) and not len(moving_spans(pairs, []))
+
+
+@pytest.mark.parametrize(("last_moving_s", "lost_s"), [(20, 0.0), (23, 4.0)])
+def test_speeds_before_a_rest_do_not_refute_it(last_moving_s, lost_s):
+    """Shaken for 20 s, with a speed once a second; one of a reading in the rest itself does."""
+    session = quiet()
+    shaken = (session.imu.t_ns < 20 * NS)[:, None] * np.random.default_rng(3).normal(0.0, 3.0, session.imu.accel.shape)
+    session = session.replace(imu=replace(session.imu, accel=session.imu.accel + shaken))
+    at = np.arange(SECONDS)
+    wheel = WheelSpeed(t_ns=at * NS, speed=np.where(at <= last_moving_s, 2.0, 0.0))
+    without = at_rest_s(session)
+    assert without == pytest.approx(100.0, abs=1.0)
+    assert at_rest_s(session.replace(wheel=wheel)) == pytest.approx(without - lost_s, abs=1.0)
