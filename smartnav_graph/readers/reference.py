@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Table, Times
-from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.errors import ConfigError, SessionError, warn
 from smartnav_graph.core.files import read_table, read_toml
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS
@@ -35,6 +35,7 @@ _EUROC = (
     *("gyro_bias_x", "gyro_bias_y", "gyro_bias_z", "accel_bias_x", "accel_bias_y", "accel_bias_z"),
 )
 _TIME_UNITS = {"t": NS, "t_s": NS, "time": NS, "timestamp": NS, "t_ns": 1, "time_ns": 1, "timestamp_ns": 1}
+_CUT = 30.0  # steps of the others
 _LARGEST_S = 1e10  # the year 2286: a larger reading is not in seconds
 
 
@@ -286,4 +287,7 @@ def _check_unit(path: Path, columns: Table) -> None:
 def _built(path: Path, columns: Table) -> Reference:
     stream, _ = build_stream(Reference, columns, path)
     assert isinstance(stream, Reference)
+    steps = np.diff(stream.t_ns) / NS
+    if len(steps) > 2 and steps[0] > _CUT * np.median(steps):
+        warn(f"{path}: row 0 lies {steps[0]:.6g} s before row 1, others {np.median(steps):.6g} s: is its stamp cut?")
     return stream

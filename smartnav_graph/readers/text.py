@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import itertools
-import logging
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ import pyarrow.compute
 import pyarrow.csv
 
 from smartnav_graph.core.arrays import Floats, Mask, Texts, Times
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, warn
 from smartnav_graph.core.timebase import NS, ns_from_text
 from smartnav_graph.readers.stamps import is_date, ns_from_date
 from smartnav_graph.readers.text_lines import (
@@ -31,7 +30,6 @@ from smartnav_graph.readers.text_lines import (
     text_rows,
 )
 
-_log = logging.getLogger(__name__)
 _COMMA, _POINT = r"^[-+]?\d*,\d+([eE][-+]?\d+)?$", r"^[-+]?\d*\.\d+([eE][-+]?\d+)?$"
 
 BLOCK = 32 << 20  # bytes that are parsed at once; of a longer file one column at a time is held as text
@@ -240,7 +238,7 @@ def read_text(path: Path, *, names: Sequence[str] | None = None, comments: str =
     names : column names, for files without a heading or with a heading behind #; by default the first line names the
         columns (a leading # is removed)
     comments : characters that start a line of remarks
-    whole : leave out a last row without line end: it may be cut
+    whole : leave out a last row without line end: it may be cut; counts are in `skipped`, without a warning
 
     What else is no row is left out, and counted: see `text_lines.TextRows`. Row numbers in errors count data rows from
     zero.
@@ -264,8 +262,8 @@ def read_text(path: Path, *, names: Sequence[str] | None = None, comments: str =
     cells = _Cells(path, tuple(columns), rows)
     long = len(start) > 2 or sum(map(len, start)) >= BLOCK
     table = TextTable(path, cells if long else cells.parse(columns, start), rows.skipped)
-    if table.skipped:
-        _log.info("%s: left out: %s", path, ", ".join(f"{count} {what}" for what, count in table.skipped.items()))
+    if table.skipped and not whole:
+        warn(f"{path}: {', '.join(f'{count} {what}' for what, count in table.skipped.items())}")
     return table
 
 

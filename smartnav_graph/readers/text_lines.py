@@ -14,7 +14,7 @@ HEAD_BYTES = 1 << 16
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _UTF8 = b"\xef\xbb\xbf"
 _SEPARATORS = ",;\t|"
-_NO_TEXT = re.compile("[\x00-\x08\x0e-\x1f\x7f-\x9f\ufffd]")  # also what is left of bytes that are no UTF-8
+NO_TEXT = re.compile("[\x00-\x08\x0e-\x1f\x7f-\x9f\ufffd]")  # also what is left of bytes that are no UTF-8
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class TextRows:
         any last row without line end: its last number may be cut.
         """
         self.skipped.clear()
-        damaged = _NO_TEXT.search(self.heading.decode("utf-8", "replace")) is not None
+        damaged = NO_TEXT.search(self.heading.decode("utf-8", "replace")) is not None
         self._skip("line with column names damaged", int(damaged))
         before = b""
         for i, lines in enumerate(self.read()):

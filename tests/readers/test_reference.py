@@ -266,3 +266,12 @@ def test_ground_truth_of_a_euroc_folder_is_the_reference(tmp_path):
     found = load_reference(tmp_path)
     np.testing.assert_array_equal(found.enu, [[1, 2, 3], [1.5, 2, 3]])
     np.testing.assert_array_equal(found.t_ns, [5_000_000, 10_000_000])
+
+
+def test_rows_that_may_be_cut_are_said(tmp_path, warned):
+    rows = [f"{104 + i / 10:.1f} {i} 0 0 0 0 0 1" for i in range(9)]
+    load_reference(write(tmp_path, "\n".join(rows) + "\n"))
+    assert warned() == ""
+    load_reference(write(tmp_path, "\n".join([rows[0][2:], *rows[1:-1], rows[-1][:9]])))
+    assert "row 0 lies 100.1 s before row 1, others 0.1 s" in warned()
+    assert "1 cut at the end of the file left out" in warned()

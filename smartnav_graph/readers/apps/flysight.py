@@ -21,7 +21,7 @@ from smartnav_graph.readers.log_session import LogParts, log_session
 from smartnav_graph.readers.samples import Samples
 from smartnav_graph.readers.source import Reader
 from smartnav_graph.readers.text import TextTable, read_bytes
-from smartnav_graph.readers.text_lines import head_of, in_utf8
+from smartnav_graph.readers.text_lines import NO_TEXT, head_of, in_utf8
 from smartnav_graph.readers.units import ACCELERATION, ANGULAR_RATE, FLUX_DENSITY, PRESSURE, plain_heading
 from smartnav_graph.session.session import Session
 
@@ -40,6 +40,7 @@ class _Records:
     rows: dict[str, list[list[str]]] = field(default_factory=dict)
     about: dict[str, str] = field(default_factory=dict)
     torn: int = 0
+    damaged: int = 0
 
     def table(self, kind: str) -> TextTable:
         """Records of one kind.
@@ -94,12 +95,15 @@ def _parse(path: Path) -> _Records:
         kind, *cells = line.strip().lstrip("$").split(",")
         if kind == "COL" and cells:
             found.names[cells[0]] = cells[1:]
+            found.damaged += NO_TEXT.search(line) is not None
         elif kind == "UNIT" and cells:
             found.units[cells[0]] = dict(zip(found.names.get(cells[0], ()), cells[1:], strict=False))
         elif kind == "VAR" and len(cells) > 1:
             found.about[cells[0]] = cells[1]
         elif kind in found.names:
             found.rows.setdefault(kind, []).append(cells)
+        elif kind not in ("", "FLYS", "DATA"):
+            found.damaged += 1
     return found
 
 
@@ -121,6 +125,9 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
             found, remedy = "has no $TIME records: its clock cannot be tied to that of the fixes", "record outdoors"
             raise SessionError(log.path, found, "at least one $TIME record", remedy)
         _add_sensors(log, line or (0, 1.0, 0), parts, repairs)
+    for file in (track, log):
+        if file is not None:
+            parts.count("session", {f"lines of {file.path.name} damaged, or of an unknown kind": file.damaged})
     if not parts.tables:
         raise SessionError(source, "holds no records", "$IMU and $GNSS records", "check the card")
     return log_session(parts, repairs, name="FlySight 2", epoch=epoch)

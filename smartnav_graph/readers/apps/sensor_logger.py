@@ -33,6 +33,10 @@ _SENSORS = (
     *("Location", "LocationGps", "LocationNetwork"),
 )
 _METADATA = "Metadata"
+_LOCATION = (
+    *("time", "seconds_elapsed", "latitude", "longitude", "altitude", "horizontalaccuracy", "verticalaccuracy"),
+    *("speed", "speedaccuracy", "bearing", "bearingaccuracy", "altitudeabovemeansealevel"),
+)
 
 
 def _csv_files(folder: Path) -> dict[str, Path]:
@@ -93,6 +97,7 @@ def _read(source: str, repairs: tuple[str, ...]) -> Session:
     fixes = None if location is None else replace(_fixes(location), above_sea=_is_ios(about))
     if location is not None and fixes is not None:
         parts.add_fixes(location.path, fixes, location.skipped)
+        parts.count("gnss", {f"column {name} not used": 1 for name in location.cells if name not in _LOCATION})
     _add_imu(path, parts, samples, about, fixes)
     device = about.get("device name") or about.get("devicename") or about.get("platform") or "Sensor Logger"
     return log_session(parts, repairs, name=device, epoch="unix")

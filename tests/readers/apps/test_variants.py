@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from exports import ACCEL, FIXES, GYRO, UNIX, androsensor, lat, phyphox, sensor_logger, sensorlog, times
+from exports import ACCEL, FIXES, GYRO, UNIX, androsensor, flysight, lat, phyphox, sensor_logger, sensorlog, times
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
@@ -135,12 +135,18 @@ def test_without_metadata_the_system_is_guessed_and_said(tmp_path, warned):
 
 def test_tables_and_columns_that_are_not_read_are_said(tmp_path):
     folder = sensor_logger(tmp_path / "drive")
-    for name, old, new in (("Barometer", "pressure", "p"), ("Location", "speedAccuracy", "sp\x01y")):
+    changes = ("Barometer", "pressure", "p"), ("Location", "bearing,", "x7,"), ("Location", "speedAccuracy", "s\x01y")
+    for name, old, new in changes:
         file = folder / f"{name}.csv"
         file.write_text(file.read_text().replace(old, new))
     session = readers.read(folder)
     assert session.dropped["session"] == {"of Barometer left out: no columns x, y, z or pressure": 2}
-    assert session.dropped["gnss"] == {"line with column names damaged": 1} and session.barometer is None
+    assert session.dropped["gnss"] == {
+        "line with column names damaged": 1,
+        "column x7 not used": 1,
+        "column s\x01y not used": 1,
+    }
+    assert session.barometer is None
     assert "session" not in readers.read(sensor_logger(tmp_path / "whole")).dropped
     file.write_bytes(file.read_bytes().replace(b"\x01", b"\0"))
     with pytest.raises(SessionError, match=r"Location\.csv: is no text"):
@@ -159,3 +165,13 @@ def test_a_phyphox_log_without_the_time_of_its_start_says_so(tmp_path, row):
     session = readers.read(folder)
     assert session.clock_epoch == "unknown" and sum(session.dropped["clock"].values()) == 1
     assert session.dropped["session"] == {"table Gyroscope uncalibrated, which has no known quantity, left out": 1}
+
+
+def test_damaged_records_of_flysight_are_counted(tmp_path):
+    folder = flysight(tmp_path / "23-11-14")
+    assert "session" not in readers.read(folder).dropped
+    file = folder / "TRACK.CSV"
+    file.write_text(file.read_text().replace("$GNSS,2023-11-14T22:13:21", "$GNS7,2023").replace("sAcc", "s\x01"))
+    session = readers.read(folder)
+    assert session.dropped["session"] == {"lines of TRACK.CSV damaged, or of an unknown kind": 2}
+    assert len(session.gnss) == FIXES - 1
