@@ -279,10 +279,17 @@ def mutate(file: Path, rng: random.Random) -> bool:
 
 
 def holds(source: Path, file: Path) -> bool:
-    """Whether a session has the readings of a Parquet file of its own: any in their range are as good as others."""
-    found = pd.DataFrame(readers.load(source).streams()[file.stem].columns())
-    written = pd.read_parquet(file).reset_index(drop=True)
-    return set(found) == set(written) and bool(np.all([_same(found[name], written[name]) for name in found]))
+    """Whether a session has the readings of a file of its own: any in their range are as good as others."""
+    streams = readers.load(source).streams()
+    if file.stem not in streams:
+        return False
+    found = pd.DataFrame(streams[file.stem].columns())
+    try:
+        written = pd.read_csv(file) if file.suffix == ".csv" else pd.read_parquet(file).reset_index(drop=True)
+    except ValueError:
+        return False
+    same = set(found) == set(written) and len(found) == len(written)
+    return same and bool(np.all([_same(found[name], written[name]) for name in found]))
 
 
 def _same(first: pd.Series, second: pd.Series) -> bool:
@@ -343,7 +350,7 @@ def judge(folder: Path, name: str, seed: int, counts: Counter[str]) -> list[str]
             counts[f"no place: {text[:160]}"] += 1
     if how == "read" and changed and name in AS_WRITTEN:
         faults += [f"another value than in the file: {text}" for text in what[1]]
-    elif how == "read" and changed and file.suffix == ".parquet" and file.exists() and holds(source, file):
+    elif how == "read" and changed and name in ("session", "csv") and file.exists() and holds(source, file):
         counts["read as written"] += 1
     elif how == "read" and changed and what[0] != with_base[0] and what[1] == with_base[1] and not_said:
         counts["read, other than its base, not reported"] += 1

@@ -93,7 +93,14 @@ def test_no_pictures(folder):
 
 
 @pytest.mark.parametrize(
-    "row", ["P0: nan 0 6 0 0 7 4 0 0 0 1 0", "P0: -7 0 6 0 0 7 4 0 0 0 1 0", "P0: 7 1 6 0 0 7 4 0 0 0 1 0", "P1: 1"]
+    "row",
+    [
+        "P0: nan 0 6 0 0 7 4 0 0 0 1 0",
+        "P0: -7 0 6 0 0 7 4 0 0 0 1 0",
+        "P0: 7 1 6 0 0 7 4 0 0 0 1 0",
+        "P1: 1",
+        "P0: 7 0 6 0 0 7 1e300 0 0 0 1 0",
+    ],
 )
 def test_a_camera_that_is_none_is_named_with_its_row(folder, row):
     (folder / "calib.txt").write_text(row + "\n")

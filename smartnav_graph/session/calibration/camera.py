@@ -68,6 +68,9 @@ class Camera:
         for name in ("width", "height", "fx", "fy", "noise_px"):
             if not 0 < getattr(self, name) <= LARGEST_PX:
                 raise self._error(f"{name} = {getattr(self, name)}", f"0 to {LARGEST_PX} px", "give pixels")
+        for name in ("cx", "cy"):
+            if not abs(getattr(self, name)) <= LARGEST_PX:
+                raise self._error(f"{name} = {getattr(self, name)}", f"-{LARGEST_PX} to {LARGEST_PX} px", "give pixels")
         for name in ("readout_s", "boresight_sigma_deg", "time_offset_sigma_s", "focal_sigma"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise self._error(f"{name} = {getattr(self, name)}", "a finite number >= 0")
