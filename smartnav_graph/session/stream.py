@@ -148,11 +148,13 @@ class Stream(Summarised):
 
     def _check_stamps(self) -> None:
         """Stamps whose differences are numbers of 64 bits."""
-        outside = np.flatnonzero((self.t_ns < -LATEST_NS) | (self.t_ns > LATEST_NS))
-        if len(outside):
-            row = int(outside[0])
-            found = f"t_ns is {self.t_ns[row]} at row {row} ({len(outside)} such rows in all)"
-            raise self._error(found, "nanoseconds of a clock", "check the unit of the stamps", row)
+        for spec in (spec for spec in self.specs() if spec.name.endswith("_ns")):
+            name, stamps = spec.metadata["columns"][0], getattr(self, spec.name)
+            outside = [] if stamps is None else np.flatnonzero((stamps < -LATEST_NS) | (stamps > LATEST_NS))
+            if len(outside):
+                row = int(outside[0])
+                found = f"{name} is {stamps[row]} at row {row} ({len(outside)} such rows in all)"
+                raise self._error(found, "nanoseconds of a clock", "check the unit of the stamps", row)
 
     def _check_rows(self) -> None:
         self._check_stamps()

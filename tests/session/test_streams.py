@@ -187,3 +187,11 @@ def test_a_picture_outside_its_folder_is_refused():
         SessionError, match=r"images: file is '\.\./secret' at row 1; expected a name inside the folder"
     ):
         dataclasses.replace(images, file=[*images.file[:1], "../secret", *images.file[2:]])
+
+
+@pytest.mark.parametrize(("name", "column"), [("imu", "t_ns"), ("imu", "arrival_ns"), ("static", "t_end_ns")])
+def test_stamps_have_differences_of_64_bits(name, column):
+    table = dict(example(STREAMS[name]).columns())
+    table[column] = np.where(np.arange(len(table[column])) == 2, -(2**63), table[column])
+    with pytest.raises(SessionError, match=rf"{column} is -9223372036854775808 at row 2 .*; expected nanoseconds"):
+        STREAMS[name].from_columns(table)
