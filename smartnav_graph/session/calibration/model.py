@@ -306,7 +306,7 @@ def calibration_from_dict(data: dict[str, Any], where: str | Path = "calibration
         An unknown key or a value that breaks a rule; it names key, value and rule.
     """
     filled = dict(data)
-    if filled.pop("schema", SCHEMA) not in (1, SCHEMA):
+    if (schema := filled.pop("schema", SCHEMA)) not in (1, SCHEMA) or type(schema) is not int:
         raise CalibrationError(where, f"schema = {data['schema']}", f"1 or {SCHEMA}", "calibrate with this version")
     name, noise = filled.get("device_class", "mems"), filled.get("imu_noise", {})
     if not isinstance(name, str) or name not in DEVICE_CLASSES:

@@ -116,7 +116,8 @@ def _field_direction(facts: Facts, size: float) -> Iterator[Finding]:
     if len(field) < LEAST_ROWS:
         return
     up = interpolate(t_ns, imu.t_ns, imu.accel)
-    sine = np.median((field * up).sum(axis=1) / np.linalg.norm(field, axis=1) / np.linalg.norm(up, axis=1))
+    sizes = np.linalg.norm(field, axis=1) * np.linalg.norm(up, axis=1)
+    sine = np.median((field * up).sum(axis=1) / np.maximum(sizes, 1e-9))
     if expected is not None and abs(size / np.linalg.norm(expected) - 1.0) < 0.3:
         wanted = float(expected[2] / np.linalg.norm(expected))
         if abs(wanted) > 0.5 and abs(sine + wanted) < 0.2:
