@@ -293,6 +293,8 @@ def holds(source: Path, file: Path) -> bool:
 
 
 def _same(first: pd.Series, second: pd.Series) -> bool:
+    if not pd.api.types.is_numeric_dtype(first):  # labels; pandas takes some for numbers
+        first, second = (column.astype(str).str.lower() for column in (first, second))
     return bool(((first == second) | (first.isna() & second.isna())).all())
 
 
