@@ -150,7 +150,9 @@ class Stream(Summarised):
         """Stamps whose differences are numbers of 64 bits."""
         for spec in (spec for spec in self.specs() if spec.name.endswith("_ns")):
             name, stamps = spec.metadata["columns"][0], getattr(self, spec.name)
-            outside = [] if stamps is None else np.flatnonzero((stamps < -LATEST_NS) | (stamps > LATEST_NS))
+            if stamps is None:
+                continue
+            outside = np.flatnonzero((stamps < -LATEST_NS) | (stamps > LATEST_NS))
             if len(outside):
                 row = int(outside[0])
                 found = f"{name} is {stamps[row]} at row {row} ({len(outside)} such rows in all)"
