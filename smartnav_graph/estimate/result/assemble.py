@@ -25,7 +25,7 @@ from smartnav_graph.factors.prior import UNKNOWN_ANGLE
 from smartnav_graph.graph.interpolate import Kinematics, kinematics, states_at
 from smartnav_graph.graph.pass_state import PassState
 from smartnav_graph.graph.robust import loss_weights
-from smartnav_graph.graph.solution import ROT, Residuals, Solution
+from smartnav_graph.graph.solution import POS, ROT, Residuals, Solution
 from smartnav_graph.graph.states import State
 from smartnav_graph.graph.windows import Window
 from smartnav_graph.session.streams import ABSOLUTE
@@ -56,10 +56,12 @@ class SolvedProblem:
 
 @dataclass(frozen=True)
 class Withheld(Summarised):
-    """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes."""
+    """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes; sigma (n, 3) m
+    of that difference, NaN for rows without a sigma of their own."""
 
     t_ns: NDArray[np.int64]
     error: Floats
+    sigma: Floats
 
     def facts(self) -> dict[str, str]:
         """Rows and RMS of the errors."""
@@ -217,7 +219,11 @@ def score_holdout(problem: Problem, keyframes: Solution, estimate: Estimate) -> 
             continue
         lever = problem.session.lever_arms(rows) + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
         p = predict_sensor(problem, keyframes, rows.t_ns, estimate.offset_s(name), lever)
-        scored[name] = Withheld(rows.t_ns, p - problem.session.nav_position(rows))
+        nearest = np.searchsorted(keyframes.t_ns[:-1] + np.diff(keyframes.t_ns) // 2, rows.t_ns)
+        variance = np.diagonal(keyframes.covariance[nearest][:, POS, POS], axis1=1, axis2=2)
+        own = np.full(p.shape, np.nan) if rows.sigma is None else rows.sigma
+        error = p - problem.session.nav_position(rows)
+        scored[name] = Withheld(rows.t_ns, error, np.sqrt(np.clip(variance, 0.0, None) + own**2))
     return scored
 
 

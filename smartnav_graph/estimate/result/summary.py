@@ -17,9 +17,10 @@ from smartnav_graph.estimate.alignment.initial_state import InitialState
 from smartnav_graph.estimate.problem import Problem
 from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld, used_counts
 from smartnav_graph.estimate.result.chi2 import chi2_of
+from smartnav_graph.estimate.result.reasons import VerdictInputs
 from smartnav_graph.estimate.result.rejections import rejections
 from smartnav_graph.estimate.result.score_tests import Unmodelled
-from smartnav_graph.estimate.result.verdict import VerdictInputs, verdict
+from smartnav_graph.estimate.result.verdict import verdict
 from smartnav_graph.estimate.reweight.false_standstills import refuted_text
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account, pair_account
 from smartnav_graph.estimate.reweight.image_weight import weight_text

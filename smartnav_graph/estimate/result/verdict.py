@@ -11,18 +11,18 @@ doubtful : the result may be wrong by more than its covariance says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from smartnav_graph.core import chi_square
-from smartnav_graph.core.arrays import Floats, Times, runs
-from smartnav_graph.core.timebase import NS, interpolate
-from smartnav_graph.estimate.result.assemble import SolvedProblem, Withheld
-from smartnav_graph.estimate.result.chi2 import IMAGES, Chi2
-from smartnav_graph.estimate.result.left_out import left_out
-from smartnav_graph.estimate.result.score_tests import SensorError, Unmodelled, sensor_errors
+from smartnav_graph.core.arrays import runs
+from smartnav_graph.core.timebase import NS
+from smartnav_graph.estimate.result.chi2 import IMAGES
+from smartnav_graph.estimate.result.predictions import fixes_left_out, predictions, withheld_points
+from smartnav_graph.estimate.result.reasons import LEVELS, Reason, Test, VerdictInputs
+from smartnav_graph.estimate.result.score_tests import SensorError, sensor_errors
 from smartnav_graph.estimate.reweight.image_pair_outliers import pair_account
 from smartnav_graph.estimate.reweight.imu_noise import worse_than_class
 from smartnav_graph.estimate.reweight.lasting_errors import lasting_errors
@@ -34,11 +34,8 @@ from smartnav_graph.graph.update import one_of
 from smartnav_graph.session.calibration.model import CARRIER_PHASE_SIGMA
 from smartnav_graph.session.health.clocks import STATE_S
 
-LEVELS = ("good", "doubtful", "contradictory")
 # Chi-square per degree of freedom of one sensor that its noise does not explain, and that nothing does.
 MISFIT, EXCLUDED = 2.0, 6.0
-# One where residuals are no less than their sigmas.
-NO_LESS = 0.8
 # Sensors under a robust loss: their tails are expected, as those of draughts are.
 ROBUST = (*IMAGES, "magnetometer", "barometer")
 # How rarely a sensor that fits reaches its chi-square.
@@ -58,10 +55,6 @@ ALIKE, LEAST_PAIRS = 0.35, 40
 # Fourth moment over the square of the second, and distance (m) of two places that fixes are at in turns; of rounded
 # coordinates a device at rest has two in turns, too.
 TWO_PLACES, LEAST_APART_M = 1.6, 5.0
-# RMS at withheld fixes against that of interpolating the kept ones, and the least number of them.
-WORSE_THAN_INTERPOLATION, LEAST_WITHHELD = 1.1, 20
-# Standard deviations by which a mean of squares is clearly larger.
-CLEARLY = 4.0
 
 
 @dataclass(frozen=True)
@@ -101,38 +94,6 @@ LIMITS = {
     "focal length": Limit(0.015, 5.0, "the motion fits a focal length {percent:+.1f} % longer", "calibrate the camera"),
     "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
 }
-
-
-@dataclass(frozen=True)
-class Reason:
-    """Why a run is not good. start_s, end_s since time zero, None for all of it; size : of the fault, in the unit of
-    the text."""
-
-    level: str
-    sensor: str
-    text: str
-    remedy: str
-    size: float | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-
-    def to_dict(self) -> dict[str, object]:
-        """As in summary.json."""
-        return {name: round(value, 4) if isinstance(value, float) else value for name, value in vars(self).items()}
-
-
-@dataclass(frozen=True)
-class VerdictInputs:
-    """What the tests look at."""
-
-    solved: SolvedProblem
-    fit: Chi2
-    withheld: Mapping[str, Withheld]
-    together: bool
-    unmodelled: Unmodelled | None = None
-
-
-Test = Callable[[VerdictInputs], Iterator[Reason]]
 
 
 def verdict(inputs: VerdictInputs) -> dict[str, object]:
@@ -330,51 +291,6 @@ def _two_places(inputs: VerdictInputs) -> Iterator[Reason]:
                 yield Reason(LEVELS[2], name, text, "look whether two receivers or datums were merged", apart)
 
 
-def _predictions(inputs: VerdictInputs) -> Iterator[Reason]:
-    """Withheld fixes: the solution against interpolation of the kept ones."""
-    session = inputs.solved.problem.session
-    for name, held in inputs.withheld.items():
-        stream, rows = session.positions().get(name), len(held.t_ns)
-        if stream is None or rows < LEAST_WITHHELD or len(stream) < 2:
-            continue
-        missing = session.nav_position(inputs.solved.problem.withheld[name])
-        at = np.searchsorted(inputs.solved.problem.withheld[name].t_ns, held.t_ns)
-        curves = interpolated(held.t_ns, stream.t_ns, session.nav_position(stream))
-        ours, theirs = _rms(held.error), min(_rms(curve - missing[at]) for curve in curves)
-        if ours > WORSE_THAN_INTERPOLATION * theirs:
-            text = f"withheld fixes are predicted to {ours:.2f} m, to {theirs:.2f} m by interpolation of the kept ones"
-            yield Reason(LEVELS[1], name, text, "check clock, axes and calibration of the inertial data", ours)
-
-
-def _left_out(inputs: VerdictInputs) -> Iterator[Reason]:
-    """Fixes left out one by one: the solution against curves through their neighbours, where the residuals are no less
-    than the sigmas: the solution follows fixes no better than these say."""
-    misfit = inputs.fit.per_dof()
-    for found in left_out(inputs.solved, LEAST_WITHHELD) if inputs.together else ():
-        ours, theirs = found.rms
-        worse = ours > WORSE_THAN_INTERPOLATION * theirs and found.sigmas > CLEARLY
-        if worse and misfit.get(found.sensor, 1.0) > NO_LESS:
-            text = (
-                f"fixes left out one by one are predicted to {ours:.2f} m, by their neighbours alone to {theirs:.2f} m"
-            )
-            yield Reason(LEVELS[1], found.sensor, text, "check clock, axes, lever arm and calibration", ours)
-
-
-def interpolated(t_ns: Times, kept_ns: Times, position: Floats) -> tuple[Floats, Floats]:
-    """Positions (n, 3) at t_ns (n,) by the line and by the cubic spline through those (m, 3) at kept_ns (m,); at both
-    ends, beyond them, constant."""
-    from scipy.interpolate import CubicSpline
-
-    first = np.flatnonzero(np.concatenate([[True], np.diff(kept_ns) > 0]))
-    seconds = (kept_ns[first] - kept_ns[0]) / NS
-    at = (np.clip(t_ns, kept_ns[0], kept_ns[-1]) - kept_ns[0]) / NS
-    return interpolate(t_ns, kept_ns, position), CubicSpline(seconds, position[first])(at)
-
-
-def _rms(error: Floats) -> float:
-    return float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
-
-
 def _recording(inputs: VerdictInputs) -> Iterator[Reason]:
     """What the recording showed before the graph was built."""
     t0 = inputs.solved.problem.session.t0_ns
@@ -394,7 +310,7 @@ def _solver(inputs: VerdictInputs) -> Iterator[Reason]:
 # What names a cause comes before what it makes of the solution.
 TESTS: tuple[Test, ...] = (
     *(_recording, _clocks, _sensor_errors, _misfits, _rejected, _noise, _constraints, _filtered, _lasting, _images),
-    *(_focal_length, _direction, _biases, _alike, _two_places, _predictions, _left_out, _solver),
+    *(_focal_length, _direction, _biases, _alike, _two_places, predictions, withheld_points, fixes_left_out, _solver),
 )
 # What compares positions with inertial data says nothing of a motion model.
 POSITIONS_ONLY: tuple[Test, ...] = (_recording, _misfits, _rejected, _alike, _solver)

@@ -31,7 +31,7 @@ def run(eight):
 
 def test_withheld_figures():
     """Errors (3, 4, 0) and (0, 0, 12): horizontal sqrt(25 / 2), 3-D sqrt(169 / 2), largest 12."""
-    rows = Withheld(np.array([0, 1]), np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 12.0]]))
+    rows = Withheld(np.array([0, 1]), np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 12.0]]), np.ones((2, 3)))
     assert rows.to_dict() == {
         "count": 2,
         "rms_horizontal_m": pytest.approx(np.sqrt(12.5)),

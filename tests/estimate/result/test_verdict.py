@@ -11,8 +11,8 @@ from planted_faults import inertial_noise
 
 import smartnav_graph as sn
 from smartnav_graph.estimate.result import verdict as verdicts
+from smartnav_graph.estimate.result.predictions import interpolated
 from smartnav_graph.estimate.result.score_tests import SensorError
-from smartnav_graph.estimate.result.verdict import interpolated
 from smartnav_graph.estimate.reweight.image_pair_outliers import Account
 from smartnav_graph.factors.coplanarity import CONTRARY, IN_USE, REASONS
 from smartnav_graph.simulation.degrade import Degrade, degrade
