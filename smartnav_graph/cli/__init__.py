@@ -44,7 +44,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "config": ("config", "ConfigCommand", "show the configuration, as the text of a config.toml"),
     "explain": ("inspection", "Explain", "explain which measurements determine the state at one epoch"),
     "compare": ("inspection", "Compare", "compare a run with another run"),
-    "export": ("runs", "Export", "export a run: TUM, KML, GPX, CSV, SBET, NMEA, GeoPackage, images ..."),
+    "export": ("runs", "Export", "export a run: TUM, KML, GPX, CSV, SBET, NMEA, GeoPackage ..."),
     "completion": ("completion", "Completion", "print the script of bash, zsh or fish that completes commands"),
     "view": ("sessions", "View", "show sessions and runs in the Rerun viewer"),
 }

@@ -38,7 +38,7 @@ def misses(session, row_time):
     at = np.searchsorted(truth.t_ns, builder.image_ns)
     R = Rotation.from_quat(truth.quat[at], scalar_first=True).as_matrix()
     motion = Motion(R, truth.velocity[at], truth.gyro_bias[at])
-    pairs, rig = builder.with_motion(builder.selection(PassState()), 0.0, motion).pairs, builder.rig
+    pairs, rig = builder.with_motion(builder.selection(PassState()), 0.0, 0.0, motion).pairs, builder.rig
     R, place = R @ rig.body_R_cam, truth.enu[at] + R @ rig.body_t_cam
     i, j = pairs.images[pairs.pair].T
     turn, way = R[i].transpose(0, 2, 1) @ R[j], (R[i].transpose(0, 2, 1) @ (place[j] - place[i])[..., None])[..., 0]

@@ -35,8 +35,8 @@ QUANTILE = 0.25
 AGREES = 0.999
 # Fixes outside this share of good ones may be outliers; they are, where this share of the scatter is left without them.
 SUSPECT, OUTLYING = 0.95, 0.5
-# Share that must be left for that where the rest is no noise.
-LEAST_KEPT = 0.6
+# Where the rest is no noise, share that must be left for that, or share of the scatter.
+LEAST_KEPT, CLEARLY_OUTLYING = 0.6, 0.2
 # Noise, not motion: growth of the scatter at twice the spacing, mean sign of neighbouring products (-0.59 if white),
 # and longest median spacing.
 NOISE_GROWTH, NOISE_SIGN, NOISE_SPACING_S = 1.5, -0.3, 2.5
@@ -92,7 +92,8 @@ def scatter(t_ns: Times, position: Floats, unit: Floats | None = None) -> Scatte
     kept = _without_outliers(t_ns, position, units) if found.is_noise else np.arange(len(t_ns))
     cleaned = _scatter(t_ns[kept], position[kept], units[kept])
     few = len(kept) > LEAST_KEPT * len(t_ns)  # more are no outliers: the scatter changes with time
-    outlying = (few or cleaned.is_noise) and cleaned.sigma < OUTLYING * found.sigma
+    most = OUTLYING if few or cleaned.is_noise else CLEARLY_OUTLYING
+    outlying = cleaned.sigma < most * found.sigma
     return replace(cleaned, rows=found.rows) if outlying else found
 
 
