@@ -28,8 +28,8 @@ NARROW_PX, WIDE_PX = 290.0, 600.0  # width of the map on a phone, on a screen an
 def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
     """Per position sensor: rows (n, 2) east, north and whether each was ``used``, ``rejected`` or ``unused``.
 
-    A fix belongs to the residual rows nearest in time, within a quarter of the sensor's median spacing.
-    Without residuals every fix inside the run counts as used.
+    Residual rows belong to the fix nearest to them (their stamps are those of keyframes, which are those of the fixes
+    or very near); a fix that no row belongs to is unused. Without residuals every fix inside the run counts as used.
     """
     found = {}
     for name, stream in session.positions().items():
@@ -47,12 +47,14 @@ def _states(stream: Positioned, name: str, residuals: Residuals) -> NDArray[np.s
     if not rows.any():
         return np.full(len(stream), "used" if not len(residuals) else "unused")
     at, used = residuals.t_ns[rows], residuals.used[rows]
-    order = np.argsort(at, kind="stable")
-    at, used = at[order], used[order]
-    spacing = float(np.median(np.diff(stream.t_ns))) if len(stream) > 1 else 1e9
-    close = nearest(stream.t_ns, at)
-    known = np.abs(at[close] - stream.t_ns) <= max(spacing / 4, 1e6)
-    return np.where(~known, "unused", np.where(used[close], "used", "rejected"))
+    stamps, row = np.unique(stream.t_ns, return_inverse=True)
+    spacing = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e9
+    own = nearest(at, stamps)
+    close = np.abs(stamps[own] - at) <= max(spacing / 4, 1e6)  # else of a fix before or after the run
+    states = np.full(len(stamps), "unused", dtype="U8")
+    states[own[close & ~used]] = "rejected"
+    states[own[close & used]] = "used"
+    return np.asarray(states[row])
 
 
 def _axes(points: Floats) -> tuple[Axis, Axis, float]:

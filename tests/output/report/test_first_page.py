@@ -140,6 +140,23 @@ def test_control_points_are_computed_less_given(tmp_path, surveyed):
     )
 
 
+def test_visits_close_to_one_another_are_told_apart(surveyed):
+    """The visit at 70 s is withheld; those of 60 s and 130 s are 10 s and a median spacing away."""
+    at, residuals = surveyed.solution.t_ns[[0, 60, 70, 130, 190, 250]], surveyed.solution.residuals
+    ids = np.array(list("ABCDEF"), dtype=object)
+    points = ControlPoint(t_ns=at, enu=np.zeros((6, 3)), sigma=np.ones((6, 3)), point_id=ids)
+    kept = np.delete(at, 2) + [0, 90_000, 0, 0, 0]  # ns: one at a keyframe of another sensor
+    residuals = replace(
+        residuals,
+        t_ns=np.r_[kept, kept[4]],
+        axis=np.arange(6) * 0,
+        used=np.array([True, True, False, True, True, False]),
+    )
+    session = surveyed.session.replace(control=points)
+    rows = control_rows(session, replace(surveyed.solution, residuals=residuals), surveyed.summary)
+    assert [row.use for row in rows] == ["in", "in", "withheld", "rejected", "in", "in"]
+
+
 def test_a_withheld_point_far_off_is_named(tmp_path, surveyed):
     sure = replace(surveyed.solution, covariance=surveyed.solution.covariance / 100)
     (warning,) = page(tmp_path, surveyed, solution=sure).xpath('//section[@id="control"]//ul/li/strong/text()')
