@@ -60,9 +60,10 @@ def lowest_and_highest(signal: Signal, most: int = MOST_ROWS) -> Signal:
     if n <= most:
         return signal
     size = -(-n // (most // (2 * table.shape[1]) - 2))
-    blocks = table[: n // size * size].reshape(-1, size, table.shape[1])
+    whole = np.pad(np.nan_to_num(table), ((0, -n % size), (0, 0)), mode="edge")  # the last row fills its stretch
+    blocks = whole.reshape(-1, size, table.shape[1])
     first = np.arange(len(blocks))[:, None] * size
-    extremes = [first + find(np.nan_to_num(blocks), axis=1) for find in (np.argmin, np.argmax)]
+    extremes = [first + find(blocks, axis=1) for find in (np.argmin, np.argmax)]
     kept = np.unique(np.concatenate([[0, n - 1], *(rows.ravel() for rows in extremes)]))
     return signal._replace(t_ns=signal.t_ns[kept], values=signal.values[kept])
 

@@ -17,7 +17,7 @@ from smartnav_graph.output.rerun_log import signals
 def test_a_long_signal_keeps_its_spikes_and_ends():
     rng = np.random.default_rng(0)
     values = rng.standard_normal((100_003, 3))
-    values[[0, 77_777, 100_002], [0, 1, 2]] = 99.0, -99.0, 99.0
+    values[[0, 77_777, 100_002, 100_001], [0, 1, 2, 0]] = 99.0, -99.0, 99.0, -99.0  # the last but one is in the rest
     whole = signals.Signal("/imu/accel", "accel", np.arange(len(values)), values)
     some = signals.lowest_and_highest(whole, 3000)
     assert len(some.t_ns) <= 3000 and (np.diff(some.t_ns) > 0).all() and some.t_ns[[0, -1]].tolist() == [0, 100_002]
