@@ -145,13 +145,10 @@ def test_visits_close_to_one_another_are_told_apart(surveyed):
     at, residuals = surveyed.solution.t_ns[[0, 60, 70, 130, 190, 250]], surveyed.solution.residuals
     ids = np.array(list("ABCDEF"), dtype=object)
     points = ControlPoint(t_ns=at, enu=np.zeros((6, 3)), sigma=np.ones((6, 3)), point_id=ids)
-    kept = np.delete(at, 2) + [0, 90_000, 0, 0, 0]  # ns: one at a keyframe of another sensor
-    residuals = replace(
-        residuals,
-        t_ns=np.r_[kept, kept[4]],
-        axis=np.arange(6) * 0,
-        used=np.array([True, True, False, True, True, False]),
-    )
+    kept = at[[0, 1, 3, 4, 5, 5]]
+    kept[1] += 90_000  # ns: at the keyframe of another sensor
+    used = np.array([True, True, False, True, True, False])
+    residuals = replace(residuals, t_ns=kept, axis=np.zeros(6, dtype=int), used=used)
     session = surveyed.session.replace(control=points)
     rows = control_rows(session, replace(surveyed.solution, residuals=residuals), surveyed.summary)
     assert [row.use for row in rows] == ["in", "in", "withheld", "rejected", "in", "in"]
