@@ -34,17 +34,22 @@ def times_ns(values: ArrayLike, where: str) -> tuple[Times, str]:
     Raises
     ------
     InputTypeError
-        Floating numbers, texts and other types.
+        Floating numbers, texts and other types; a single time; times with and without time zone.
     SessionError
         Missing times, or whole numbers that are no nanoseconds.
     """
-    array = _naive(values)
+    array = _naive(values, where)
+    if array.ndim != 1:
+        found = f"of shape {array.shape}" if array.ndim else "one time alone"
+        raise InputTypeError(f"{where}: times", f"are {found}", "(n,), one time per row", "give an array or a list")
     if array.dtype.kind in "Mm":
         return _exact_ns(array, where), "unix" if array.dtype.kind == "M" else "unknown"
     if array.dtype.kind not in "iu":
         what = "floating numbers" if array.dtype.kind == "f" else f"of type {array.dtype}"
         remedy = SECONDS if array.dtype.kind == "f" else "convert them with pandas.to_datetime(..., utc=True)"
         raise InputTypeError(f"{where}: times", f"are {what}", "datetime64 or whole nanoseconds", remedy)
+    if array.dtype.kind == "u" and len(array) and array.max() > np.iinfo(np.int64).max:
+        _refuse_range(where)
     t_ns = np.asarray(array, dtype=np.int64)
     period = float(np.median(np.diff(t_ns))) if len(t_ns) > 2 else np.inf
     if 0 < period < SHORTEST_NS:
@@ -54,23 +59,37 @@ def times_ns(values: ArrayLike, where: str) -> tuple[Times, str]:
     return t_ns, "unknown"
 
 
-def _naive(values: ArrayLike) -> Column:
+def _naive(values: ArrayLike, where: str) -> Column:
     """Times as an array; those with a time zone in UTC."""
-    if getattr(getattr(values, "dtype", None), "tz", None) is not None:  # a Series or an index of pandas
+    dtype = getattr(values, "dtype", None)
+    if getattr(dtype, "kind", "") == "M" and not isinstance(dtype, np.dtype):  # a Series or an index of pandas
         import pandas as pd
 
-        return pd.DatetimeIndex(np.asarray(values)).tz_convert("UTC").tz_localize(None).to_numpy()
+        index = pd.DatetimeIndex(cast("pd.Series", values))
+        return index.to_numpy() if index.tz is None else index.tz_convert("UTC").tz_localize(None).to_numpy()
     array = np.asarray(values)
-    if array.dtype != object or not len(array):
-        return array
-    first = array[0]
-    if not hasattr(first, "utcoffset"):
-        return array
-    if any(one.utcoffset() is not None for one in array):
-        import datetime
+    return _of_datetimes(array, where) if array.dtype == object and array.ndim == 1 and len(array) else array
 
-        array = np.array([one.astimezone(datetime.UTC).replace(tzinfo=None) for one in array])
-    return array.astype("datetime64[ns]")
+
+def _of_datetimes(array: Column, where: str) -> Column:
+    """Datetimes of Python or pandas (n,) as datetime64 in UTC, NaT where one is missing; other objects as they are."""
+    import pandas as pd
+
+    there = ~pd.isna(array)
+    if not there.any() or not all(hasattr(one, "utcoffset") for one in array[there]):
+        return array
+    zoned = {one.utcoffset() is not None for one in array[there]}
+    if len(zoned) > 1:
+        remedy = "convert them with pandas.to_datetime(..., utc=True)"
+        raise InputTypeError(f"{where}: times", "some with, some without time zone", "one kind", remedy)
+    try:
+        return pd.to_datetime(pd.Index(array, dtype=object), utc=True).tz_localize(None).to_numpy()
+    except pd.errors.OutOfBoundsDatetime:
+        _refuse_range(where)
+
+
+def _refuse_range(where: str) -> NoReturn:
+    raise SessionError(f"{where}: times", "do not fit int64 nanoseconds", "1678 to 2262", "correct the dates")
 
 
 def _exact_ns(array: Column, where: str) -> Times:
@@ -82,13 +101,17 @@ def _exact_ns(array: Column, where: str) -> Times:
     kind = "datetime64[ns]" if array.dtype.kind == "M" else "timedelta64[ns]"
     t_ns = array.astype(kind)
     if not (t_ns.astype(array.dtype) == array).all():
-        raise SessionError(f"{where}: times", "do not fit int64 nanoseconds", "1678 to 2262", "correct the dates")
+        _refuse_range(where)
     return np.asarray(t_ns.astype(np.int64))
 
 
 def columns_of_frame(frame: pd.DataFrame, where: str) -> Table:
     """Columns of a DataFrame; its index is their time where no column is."""
     columns: Table = {}
+    twice = [str(name) for name in frame.columns[frame.columns.duplicated()]]
+    if twice:
+        remedy = "frame.loc[:, ~frame.columns.duplicated()] keeps the first"
+        raise SessionError(where, f"several columns {', '.join(dict.fromkeys(twice))}", "one of each name", remedy)
     for name in frame.columns:
         if str(name) not in TIME_NAMES:
             column = frame[name]

@@ -159,6 +159,7 @@ class Session(Summarised, Streams):
         SessionError
             A column, row, time or unit that does not fit.
         """
+        repairs = tuple(repairs)  # an iterator serves one stream only
         built, epoch, dropped = build_streams(streams, clock_epoch, repairs)
         located = [one for one in built.values() if isinstance(one, Located)]
         found = cls(

@@ -8,6 +8,7 @@ import pytest
 
 import smartnav_graph as sn
 from smartnav_graph.core.frames import STANDARD_GRAVITY
+from smartnav_graph.session.from_arrays import times_ns
 
 N = 200
 T_NS = 1_748_772_000_000_000_000 + np.arange(N) * 10_000_000  # 2025-06-01 10:00 UTC, 100 Hz
@@ -39,13 +40,45 @@ def as_python(zone):
         pd.Series(pd.to_datetime(T_NS, utc=True).tz_convert("Europe/Berlin")),
         pd.to_datetime(T_NS, utc=True).tz_convert("Asia/Kolkata"),
         as_python(datetime.timezone(datetime.timedelta(hours=-8))),
+        [t.replace(tzinfo=None) for t in as_python(datetime.UTC)],
     ],
-    ids=["ns", "us", "ms", "pandas", "Berlin", "Kolkata", "datetime"],
+    ids=["ns", "us", "ms", "pandas", "Berlin", "Kolkata", "datetime", "naive"],
 )
 def test_a_datetime_of_any_unit_and_zone_is_the_same_instant(time):
     found = session(time)
     np.testing.assert_array_equal(found.imu.t_ns, T_NS)
     assert found.clock_epoch == "unix" and "2025-06-01T10:00" in repr(found)
+
+
+@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
+def test_single_nanoseconds_are_kept(zone):
+    stamps = pd.Series(pd.to_datetime(T_NS + 123, utc=True).tz_convert(zone))
+    for time in (list(stamps), stamps.astype(object), arrow := stamps.convert_dtypes(dtype_backend="pyarrow")):
+        np.testing.assert_array_equal(times_ns(time, "imu")[0], T_NS + 123)
+    for empty in (stamps[:0], arrow[:0]):
+        assert times_ns(empty, "imu")[0].shape == (0,)
+
+
+NOON = datetime.datetime(2025, 6, 1, 12)
+
+
+@pytest.mark.parametrize(
+    ("time", "text"),
+    [
+        ([NOON, None], r"no time \(NaT\) at row 1"),
+        ([pd.NaT, pd.Timestamp(NOON)], r"no time \(NaT\) at row 0"),
+        ([NOON, NOON.replace(tzinfo=datetime.UTC)], "some with, some without time zone"),
+        ([NOON.replace(year=4000)] * 2, "do not fit int64 nanoseconds"),
+        (NOON, r"one time alone; expected \(n,\)"),
+        (5, "one time alone"),
+        (np.array([[5]]), r"of shape \(1, 1\)"),
+        (np.array([2**63 + 5], dtype=np.uint64), "do not fit int64 nanoseconds"),
+        ([NOON, "noon"], "of type object"),
+    ],
+)
+def test_times_that_are_none_are_refused_by_name(time, text):
+    with pytest.raises(sn.SmartnavError, match=text):
+        times_ns(time, "imu")
 
 
 def test_timedeltas_and_whole_nanoseconds_are_a_clock_without_date():
@@ -112,6 +145,17 @@ def test_names_that_are_missing_or_unknown(warned):
         sn.Session.from_pandas(imu=frame(), gps=frame())
     with pytest.raises(sn.SmartnavError, match=r"no times: columns .*; expected a column t_ns or time"):
         sn.Session.from_pandas(imu=frame().drop(columns="time"))
+
+
+def test_a_column_that_is_there_twice_is_named():
+    for name in ("time", COLUMNS[0]):
+        with pytest.raises(sn.SmartnavError, match=f"imu: several columns {name}; expected one of each name"):
+            sn.Session.from_pandas(imu=pd.concat([frame(), frame()[[name]]], axis=1))
+
+
+def test_repairs_of_an_iterator_serve_every_stream():
+    fixes = {"time": T_NS[:3], "enu": [[np.nan] * 3, [0.0] * 3, [1.0] * 3], "sigma": np.full((3, 3), 3.0)}
+    assert len(session(T_NS, gnss=fixes, repairs=iter(["nan"])).gnss) == 2
 
 
 def test_what_is_no_stream_says_what_to_build():
