@@ -17,10 +17,13 @@ from smartnav_graph.core.errors import SessionError, SmartnavError
 from smartnav_graph.output.progress import progress
 
 if TYPE_CHECKING:
+    from smartnav_graph.core.progress import Progress
+    from smartnav_graph.estimate.both_ways import BothWays
     from smartnav_graph.estimate.config import Config
     from smartnav_graph.estimate.run import Run
     from smartnav_graph.evaluation import Evaluation
     from smartnav_graph.output.run_folder import StoredRun
+    from smartnav_graph.session.session import Session
 
 # Exit code of a run that is finished and written, and whose measurements exclude each other.
 CONTRADICTORY = 3
@@ -69,21 +72,23 @@ class Replay(Estimating):
 def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> int:
     """Load, estimate, write, print; the exit code."""
     from smartnav_graph import readers
-    from smartnav_graph.estimate.both_ways import both_ways
     from smartnav_graph.estimate.replay import replay
     from smartnav_graph.estimate.run import smooth
+    from smartnav_graph.output.report.about import check_shown
     from smartnav_graph.output.run_folder import check_out, write_run
     from smartnav_graph.output.summary_json import table_of, text_of
 
     check_out(command.out, command.force)
+    check_shown(config.report)
     with progress(command.quiet) as show:
         show(f"reading {command.session}", 0, 0)
         begin = time.perf_counter()
         session = readers.load(command.session, repairs=repairs(command.repair))
         load_s = time.perf_counter() - begin
+        check_shown(config.report, session)
         run = (replay if causal else smooth)(session, config, progress=show)
         evaluation = against_own_reference(run)
-        ways = both_ways(session, config, show) if config.report.forward_backward else None
+        ways = forward_and_backward(session, config, show) if config.report.forward_backward else None
         summary = write_run(
             *(run, command.out), force=command.force, evaluation=evaluation, ways=ways, load_s=load_s, progress=show
         )
@@ -91,6 +96,21 @@ def estimate_to_folder(command: Estimating, config: Config, *, causal: bool) -> 
         print("smartnav: interrupted; the part that was done is written", file=sys.stderr)
     print_findings(run_text(summary, command.out))
     return CONTRADICTORY if text_of(table_of(summary, "verdict"), "level") == "contradictory" else 0
+
+
+def forward_and_backward(session: Session, config: Config, show: Progress) -> BothWays | None:
+    """The filter in both directions; None, and a line that says why, where one of them cannot be computed."""
+    from smartnav_graph.estimate.both_ways import both_ways
+
+    try:
+        ways = both_ways(session, config, show)
+    except SmartnavError as error:
+        print(f"smartnav: forward and backward are not compared: {error}", file=sys.stderr)
+        return None
+    if not len(ways.t_ns):
+        print("smartnav: forward and backward are not compared: they have no time in common", file=sys.stderr)
+        return None
+    return ways
 
 
 def against_own_reference(run: Run) -> Evaluation | None:

@@ -12,8 +12,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import LocalFrame
 from smartnav_graph.core.timebase import NS, utc_from_gps
-from smartnav_graph.estimate.config import LOGOS, Config
+from smartnav_graph.estimate.config import LOGOS, Config, ReportConfig
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report.statistics import place_of
@@ -101,14 +102,16 @@ def _coordinates(solution: Solution, crs: str) -> list[str]:
         return ["Local metres east, north, up of the recording; no geodetic datum is known"]
     lines = ["Geodetic datum of the inputs, taken as WGS 84"]
     lines.append(f"East, north, up: tangent plane at {place_of(solution.origin)}")
-    if crs:
-        import pyproj
+    return [*lines, f"Control points also in {crs}, {_name_of(crs)}"] if crs else lines
 
-        try:
-            lines.append(f"Control points also in {crs}, {pyproj.CRS.from_user_input(crs).name}")
-        except pyproj.exceptions.CRSError as error:
-            raise SessionError(f"report.crs {crs}", "is not known", "a system such as EPSG:25832") from error
-    return lines
+
+def _name_of(crs: str) -> str:
+    import pyproj
+
+    try:
+        return str(pyproj.CRS.from_user_input(crs).name)
+    except pyproj.exceptions.CRSError as error:
+        raise SessionError(f"report.crs {crs}", "is not known", "a system such as EPSG:25832") from error
 
 
 def _heights(session: Session, solution: Solution) -> list[str]:
@@ -148,6 +151,25 @@ def _settings(config: Config) -> list[str]:
         return ["all options at their defaults"]
     more = [f"and {len(changed) - FEW} more, see Settings"] if len(changed) > FEW else []
     return [*(f"{one.name} = {one.value}" for one in changed[:FEW]), *more]
+
+
+def check_shown(report: ReportConfig, session: Session | None = None) -> None:
+    """Check logo and coordinate system before a run is computed for a report that cannot be written.
+
+    Raises
+    ------
+    SessionError
+        The logo cannot be read, the system is not known, or does not hold at the control points of `session`.
+    """
+    logo_uri(report.logo)
+    if not report.crs:
+        return
+    _name_of(report.crs)
+    if session is not None and session.origin is not None and session.control is not None:
+        from smartnav_graph.output.export.coordinates import transformed
+
+        nav = session.nav_position(session.control)
+        transformed(LocalFrame(session.origin).lla_from_nav(nav), report.crs)
 
 
 def logo_uri(path: str) -> str:

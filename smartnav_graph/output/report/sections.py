@@ -54,6 +54,7 @@ def page(
     gaps = imu_gaps(summary)
     shaded = [(start, start + length) for start, length, _ in gaps]
     points = control_rows(session, solution, summary, "" if config is None else config.report.crs)
+    both = charts.forward_backward(ways, solution, shaded) if ways is not None and len(ways.t_ns) else ""
     parts = [
         verdict_section(summary),
         filled(
@@ -69,7 +70,7 @@ def page(
         gap_section(summary, gaps),
         *plots_over_time(solution, shaded, causal_solution),
         section("updates", "Real-time (causal) performance", causal.draw(updates, solution, shaded) if updates else ""),
-        section("both-ways", "Forward and backward", charts.forward_backward(ways, solution, shaded) if ways else ""),
+        section("both-ways", "Forward and backward", both),
         withheld_section(summary, scored, solution, shaded),
         against_reference(evaluation, solution, shaded),
         *estimation(summary),

@@ -17,6 +17,7 @@ from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config, ReportConfig, RunConfig
 from smartnav_graph.graph.solution import Residuals
 from smartnav_graph.output.report import write_report
+from smartnav_graph.output.report.about import check_shown
 from smartnav_graph.output.report.control_points import control_rows
 from smartnav_graph.session.session import Mount, Session
 from smartnav_graph.session.streams import ControlPoint
@@ -180,9 +181,17 @@ def test_control_points_in_a_national_system(tmp_path, surveyed):
     assert "ETRS89 / UTM zone 32N" in facts(dom)["Coordinates"][-1]
 
 
+def test_a_system_that_does_not_hold_there_is_seen_before_the_run(surveyed):
+    check_shown(ReportConfig(crs="EPSG:25832"), surveyed.session)
+    with pytest.raises(SessionError, match="geoid grid"):
+        check_shown(ReportConfig(crs="EPSG:5555"), surveyed.session)
+
+
 def test_forward_and_backward_are_compared(tmp_path, case):
     sigma = np.full((len(case.solution), 3), 0.5)
     ways = BothWays(case.solution.t_ns, np.tile([0.3, -0.4, 1.2], (len(sigma), 1)), sigma)
     (found,) = page(tmp_path, case, ways=ways).xpath('//section[@id="both-ways"]')
     assert "RMS east 0.300 m, north 0.400 m, up 1.20 m; 66.7 % inside two sigma" in found.text_content()
-    assert not page(tmp_path, case).xpath('//section[@id="both-ways"]')
+    none = BothWays(*(values[:0] for values in (ways.t_ns, ways.difference, ways.sigma)))
+    for without in (None, none):
+        assert not page(tmp_path, case, ways=without).xpath('//section[@id="both-ways"]')
