@@ -26,13 +26,14 @@ RIDGE = 1e-13
 @dataclass(frozen=True)
 class Measurements:
     """Every factor of the graph: source (f,), t_ns (f,), row (f,), share (f, 15) of the variance of the keyframe and
-    shift (f, 15) in sigmas."""
+    shift (f, 15) in sigmas; part (f,): ties beside the measurements of a source, such as of a correlated error."""
 
     source: NDArray[np.object_]
     t_ns: Times
     row: NDArray[np.int64]
     share: Floats
     shift: Floats
+    part: Mask
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ def influence_of_keyframe(influence: Influence, place: int) -> KeyframeInfluence
             row=np.concatenate([group.row for group in influence.groups]),
             share=system.by_factor @ K**2 / variance,
             shift=system.by_factor @ shift,
+            part=np.concatenate([np.full(len(g.t_ns), builder_of(g.sensor) != g.sensor) for g in influence.groups]),
         ),
     )
 

@@ -125,7 +125,7 @@ class Explanation:
         """Measurements that shift the position or the heading most, without the inertial ones."""
         all_rows = self.keyframe.measurements
         shift = np.abs(all_rows.shift[:, [3, 4, 5, YAW]]).max(axis=1)
-        shift[np.isin(all_rows.source, NO_ROWS)] = 0.0
+        shift[np.isin(all_rows.source, NO_ROWS) | all_rows.part] = 0.0
         order = np.argsort(-shift, kind="stable")[:STRONGEST]
         return [int(i) for i in order if shift[i] > 0.0]
 

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.timebase import seconds_since
 from smartnav_graph.evaluation.influence import CALIBRATION, Measurements
 from smartnav_graph.output.run_folder import StoredRun
 from smartnav_graph.output.summary_json import Summary, as_float, imu_gaps, rows_of, standstill_spans, text_of
+from smartnav_graph.session.streams import POSITIONS
+
+# Without fixes for longer than so many of their median periods, and so many seconds, is an outage.
+PERIODS, LEAST_S = 3.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -51,12 +57,14 @@ class Rejection:
 
 @dataclass(frozen=True)
 class Nearby:
-    """The nearest of each kind, None where the run has none; used: by source."""
+    """The nearest of each kind, None where the run has none; used: by source; outages: of the position fixes, by
+    source, from the last one before the instant to the next one, s, None where there is none."""
 
     gap: Span | None
     standstill: Span | None
     rejection: Rejection | None
     used: Mapping[str, Neighbours]
+    outages: Mapping[str, tuple[float | None, float | None]]
 
 
 def nearby(run: StoredRun, measurements: Measurements, t_s: float) -> Nearby:
@@ -64,12 +72,15 @@ def nearby(run: StoredRun, measurements: Measurements, t_s: float) -> Nearby:
     standstills = [(start, end - start, "standstill") for start, end in standstill_spans(run.summary)]
     rejected = [Rejection.of(row, t_s) for row in rows_of(run.summary, "rejections")]
     seconds = seconds_since(measurements.t_ns, run.solution.t0_ns)
-    names = sorted({str(name) for name in measurements.source} - {"imu", "prior", CALIBRATION})
+    names = sorted({str(name) for name in measurements.source[~measurements.part]} - {"imu", "prior", CALIBRATION})
+    by_name = {name: seconds[(measurements.source == name) & ~measurements.part] for name in names}
+    outages = {name: _outage(by_name[name], t_s) for name in POSITIONS if name in by_name and name != "control"}
     return Nearby(
         gap=_nearest(imu_gaps(run.summary), t_s),
         standstill=_nearest(standstills, t_s),
         rejection=min(rejected, key=lambda one: abs(one.away_s), default=None),
-        used={name: _neighbours(seconds[measurements.source == name], t_s) for name in names},
+        used={name: _neighbours(times, t_s) for name, times in by_name.items()},
+        outages={name: span for name, span in outages.items() if span is not None},
     )
 
 
@@ -85,3 +96,14 @@ def _neighbours(seconds: Floats, t_s: float) -> Neighbours:
     before, after = t_s - seconds[seconds <= t_s + 1e-6], seconds[seconds > t_s + 1e-6] - t_s
     nearest = [round(max(float(side.min()), 0.0), 4) if len(side) else None for side in (before, after)]
     return Neighbours(*nearest)
+
+
+def _outage(seconds: Floats, t_s: float) -> tuple[float | None, float | None] | None:
+    """The ends of the time without fixes around an instant, where it is longer than usual."""
+    times = np.unique(seconds)
+    limit = max(LEAST_S, PERIODS * float(np.median(np.diff(times)))) if len(times) > 1 else LEAST_S
+    near = _neighbours(times, t_s)
+    if near.before_s == 0.0 or sum(side or 0.0 for side in (near.before_s, near.after_s)) <= limit:
+        return None
+    before = None if near.before_s is None else round(t_s - near.before_s, 4)
+    return before, None if near.after_s is None else round(t_s + near.after_s, 4)

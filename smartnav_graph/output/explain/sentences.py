@@ -142,6 +142,14 @@ def _in_use(near: Nearby) -> Iterator[str]:
     parts = [f"{title_of(name)} {_before_after(one.before_s, one.after_s)}" for name, one in near.used.items()]
     if parts:
         yield f"Nearest measurements in use: {'; '.join(parts)}."
+    for name, (start, end) in near.outages.items():
+        yield f"This epoch is inside an outage: no {title_of(name)} in use {_between(start, end)}."
+
+
+def _between(start: float | None, end: float | None) -> str:
+    if start is not None and end is not None:
+        return f"between {start:.1f} and {end:.1f} s"
+    return f"before {end:.1f} s" if start is None else f"after {start:.1f} s"
 
 
 def _before_after(before: float | None, after: float | None) -> str:

@@ -14,6 +14,7 @@ from smartnav_graph.evaluation.influence import Group, Influence, Keyframes, Mea
 from smartnav_graph.graph.states import key
 from smartnav_graph.output.explain import explain
 from smartnav_graph.output.explain.nearby import nearby
+from smartnav_graph.output.explain.sentences import _in_use
 from smartnav_graph.output.run_folder import plain, read_run, write_run
 
 
@@ -97,7 +98,7 @@ def test_what_is_near():
     run = SimpleNamespace(summary=summary, solution=SimpleNamespace(t0_ns=0))
     stamps = np.array([4.0, 7.5, 5.0]) * 1e9
     rows = Measurements(
-        np.array(["gnss", "gnss", "imu"], dtype=object), stamps.astype(np.int64), *[np.zeros((3, 1))] * 3
+        np.array(["gnss", "gnss", "imu"], dtype=object), stamps.astype(np.int64), *[np.zeros((3, 1))] * 3, np.zeros(3, bool)
     )
     found = nearby(run, rows, 5.0)
     assert (found.gap.start_s, found.gap.away_s, found.gap.length_s) == (1.0, -2.0, 2.0)
@@ -108,6 +109,35 @@ def test_what_is_near():
     assert nearby(run, rows, 2.0).gap.away_s == 0.0
     nothing = nearby(SimpleNamespace(summary={}, solution=run.solution), rows, 5.0)
     assert (nothing.gap, nothing.standstill, nothing.rejection) == (None, None, None)
+
+
+def test_in_an_outage_only_real_fixes_are_near():
+    """Fixes every second with none from 20 to 30 s, and a tie of their correlated error every second."""
+    fixes = np.array([*range(21), *range(30, 41)], dtype=np.int64)
+    stamps = np.concatenate([fixes, np.arange(41)]) * 10**9
+    part = np.arange(len(stamps)) >= len(fixes)
+    source = np.full(len(stamps), "gnss", dtype=object)
+    rows = Measurements(source, stamps, *[np.zeros((len(stamps), 1))] * 3, part)
+    run = SimpleNamespace(summary={}, solution=SimpleNamespace(t0_ns=0))
+    found = nearby(run, rows, 26.0)
+    assert (found.used["gnss"].before_s, found.used["gnss"].after_s) == (6.0, 4.0)
+    assert list(_in_use(found)) == [
+        "Nearest measurements in use: GNSS 6.00 s before, 4.00 s after.",
+        "This epoch is inside an outage: no GNSS in use between 20.0 and 30.0 s.",
+    ]
+    assert nearby(run, rows, 45.0).outages == {"gnss": (40.0, None)}
+    assert not nearby(run, rows, 10.0).outages and not nearby(run, rows, 20.0).outages
+    assert not nearby(run, rows, 35.5).outages
+
+
+def test_ties_of_a_correlated_error_are_no_measurements(tmp_path):
+    """A phone's fixes, those of ten seconds withheld."""
+    run = sn.run(sn.simulate("phone-car-5min", 3), start_s=10.0, end_s=60.0, withhold=("gnss:outage=30-40",))
+    write_run(run, tmp_path / "run", report=False, recording=False)
+    found = explain(read_run(tmp_path / "run"), 35.0)
+    assert "gnss_correlated_error" in {group.sensor for group in found.figures.influence.groups}
+    assert "no GNSS in use between 29." in sentence_of(found, "This epoch is inside an outage")
+    assert all(row["row"] >= 0 for row in found.to_dict()["measurements"] if row["source"] == "gnss")
 
 
 @pytest.mark.parametrize("at", [-0.5, 20.5, float("nan")])
