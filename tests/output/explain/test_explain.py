@@ -97,9 +97,8 @@ def test_what_is_near():
     }
     run = SimpleNamespace(summary=summary, solution=SimpleNamespace(t0_ns=0))
     stamps = np.array([4.0, 7.5, 5.0]) * 1e9
-    rows = Measurements(
-        np.array(["gnss", "gnss", "imu"], dtype=object), stamps.astype(np.int64), *[np.zeros((3, 1))] * 3, np.zeros(3, bool)
-    )
+    source, zeros = np.array(["gnss", "gnss", "imu"], dtype=object), np.zeros((3, 1))
+    rows = Measurements(source, stamps.astype(np.int64), zeros, zeros, zeros, np.zeros(3, bool))
     found = nearby(run, rows, 5.0)
     assert (found.gap.start_s, found.gap.away_s, found.gap.length_s) == (1.0, -2.0, 2.0)
     assert (found.standstill.start_s, found.standstill.away_s) == (0.0, -1.0)
