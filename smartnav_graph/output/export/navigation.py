@@ -1,9 +1,9 @@
 """SBET and NMEA 0183: trajectories as survey software reads them. Both need dates: a clock of the Unix or GPS epoch.
 
-SBET (Applanix, smoothed best estimate of trajectory): 17 little-endian doubles a row. Time in seconds of the GPS week;
-latitude and longitude rad, ellipsoidal height m; velocity m/s north, east, down; roll, pitch, heading rad; the azimuth
-of the frame of velocities, zero; acceleration m/s^2 with gravity removed, and angular rate rad/s, forward, right, down
-(zero where the run holds no inertial data).
+SBET (Applanix, smoothed best estimate of trajectory): 17 little-endian doubles a row. Time in seconds of the GPS week
+in which the run begins, rising beyond its end; latitude and longitude rad, ellipsoidal height m; velocity m/s north,
+east, down; roll, pitch, heading rad; the azimuth of the frame of velocities, zero; acceleration m/s^2 with gravity
+removed, and angular rate rad/s, forward, right, down (zero where the run holds no inertial data).
 
 NMEA: GGA of quality 6 (estimated), RMC, GST, and THS (true heading). Heights are ellipsoidal, and the geoid separation
 is zero.
@@ -46,7 +46,9 @@ def utc_ns(solution: Solution, clock_epoch: str, format: str) -> Times:
 
 def write_sbet(solution: Solution, path: Path, clock_epoch: str) -> None:
     """One row an epoch."""
-    week_s = (gps_from_utc(utc_ns(solution, clock_epoch, "sbet")) % WEEK_NS) / NS
+    utc = utc_ns(solution, clock_epoch, "sbet")
+    gps = solution.t_ns if clock_epoch == "gps" else gps_from_utc(utc)
+    week_s = (gps - gps[:1] // WEEK_NS * WEEK_NS) / NS
     lat, lon, height = lla_of(solution).T
     east, north, up = solution.nav_v_body.T
     heading, pitch, roll = np.radians(solution.heading_pitch_roll_deg).T
@@ -80,7 +82,7 @@ def _sentences(solution: Solution, t_ns: Times) -> Iterator[str]:
     speed = (np.linalg.norm(solution.nav_v_body[:, :2], axis=1) * KNOTS).tolist()
     course = (np.degrees(np.arctan2(*solution.nav_v_body[:, :2].T)) % 360.0).tolist()
     sigma = solution.sigmas[:, POS].tolist()
-    for row, stamp in enumerate((t_ns // 1_000_000).tolist()):
+    for row, stamp in enumerate(((t_ns + 500_000) // 1_000_000).tolist()):
         seconds, ms = divmod(stamp, 1000)
         when = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
         at = f"{when:%H%M%S}.{ms:03d}"
@@ -88,9 +90,14 @@ def _sentences(solution: Solution, t_ns: Times) -> Iterator[str]:
         place = f"{_degrees(lat, 2, 'NS')},{_degrees(lon, 3, 'EW')}"
         e, n, u = sigma[row]
         yield _closed(f"GPGGA,{at},{place},6,,,{height:.4f},M,0.0,M,,")
-        yield _closed(f"GPRMC,{at},A,{place},{speed[row]:.3f},{course[row]:.2f},{when:%d%m%y},,,E")
+        yield _closed(f"GPRMC,{at},A,{place},{speed[row]:.3f},{_turn(course[row], 2)},{when:%d%m%y},,,E")
         yield _closed(f"GPGST,{at},,,,,{n:.4f},{e:.4f},{u:.4f}")
-        yield _closed(f"GPTHS,{heading[row]:.3f},E")
+        yield _closed(f"GPTHS,{_turn(heading[row], 3)},E")
+
+
+def _turn(value: float, digits: int) -> str:
+    """Degrees below 360 after rounding, too."""
+    return f"{round(value, digits) % 360.0:.{digits}f}"
 
 
 def _degrees(value: float, width: int, letters: str) -> str:

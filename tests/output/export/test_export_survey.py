@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from fiona.transform import transform
 from pynmeagps import NMEAReader
+from scipy.spatial.transform import Rotation
 from test_export import T0, lla, make_solution, solution  # noqa: F401
 
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate_back
+from smartnav_graph.core.timebase import utc_from_gps
 from smartnav_graph.output.export import export
 from smartnav_graph.session.streams import Imu
 
@@ -54,6 +56,27 @@ def test_sbet_acceleration_is_without_gravity_and_forward_right_down(solution, t
     assert rows[:, 11:] == pytest.approx(np.tile([2.0, 0, 0, 0, 0, -0.1], (len(solution), 1)), abs=1e-12)
 
 
+@pytest.mark.parametrize("epoch", ["unix", "gps"])
+def test_sbet_time_rises_beyond_the_end_of_the_week(solution, tmp_path, epoch):  # noqa: F811
+    week = 604_800 * 10**9
+    end = 2300 * week if epoch == "gps" else int(utc_from_gps(np.array([2300 * week]))[0])
+    shifted = replace(solution, t_ns=solution.t_ns - solution.t_ns[0] + end - 10**9)
+    export(shifted, "sbet", tmp_path / "a.sbet", clock_epoch=epoch)
+    expected = 604_799 + (solution.t_ns - solution.t_ns[0]) / 1e9
+    assert sbet(tmp_path / "a.sbet")[:, 0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_nmea_rounds_times_and_full_turns(solution, tmp_path):  # noqa: F811
+    """Just west of north, 0.4 ms before a full second."""
+    t_ns = T0 - T0 % 10**9 + np.arange(len(solution)) * 10**9 - 400_000
+    north = np.tile([-1e-6, 1.0, 0.0], (len(solution), 1))
+    pose = np.broadcast_to(Rotation.from_euler("z", 1e-4, degrees=True).as_matrix(), (len(solution), 3, 3))
+    path = tmp_path / "a.nmea"
+    export(replace(solution, t_ns=t_ns, nav_v_body=north, nav_R_body=pose), "nmea", path, clock_epoch="unix")
+    gga, rmc, _, ths = (line.split(",") for line in path.read_text().splitlines()[:4])
+    assert (gga[1], rmc[8], ths[1]) == ("100000.000", "0.00", "0.000")
+
+
 def test_nmea_reads_back(solution, lla, tmp_path):  # noqa: F811
     path = tmp_path / "a.nmea"
     export(solution, "nmea", path, clock_epoch="unix")
@@ -66,7 +89,7 @@ def test_nmea_reads_back(solution, lla, tmp_path):  # noqa: F811
     assert (str(messages[1].date), str(messages[1].time)) == ("2025-06-01", "10:00:00.123000")
     assert {(m.stdLat, m.stdLong, m.stdAlt) for m in messages[2::4]} == {(0.4, 0.3, 2.0)}
     found = readers.load(path).gnss
-    assert len(found) == len(solution) and np.abs(found.t_ns - solution.t_ns).max() < 1_000_001
+    assert len(found) == len(solution) and np.abs(found.t_ns - solution.t_ns).max() < 500_001
     assert found.lla == pytest.approx(lla, abs=1e-4) and found.sigma[0] == pytest.approx([0.3, 0.4, 2.0])
 
 
