@@ -101,9 +101,18 @@ def fit(sources: Sequence[Path], options: StereoOptions) -> CalibrationResult:
     return _result(found, alone, options, [*left_out_lines(dropped), *warnings])
 
 
-def number_of(name: str) -> str:
-    """The numbers of a file name, by which pictures are paired."""
-    return "_".join(str(int(part)) for part in re.findall(r"\d+", Path(name).stem))
+def numbers_of(left: Sequence[str], right: Sequence[str]) -> list[list[str]]:
+    """The numbers of every file name of both folders, by which pictures are paired. Leading ones that all names of a
+    folder share are left out: the camera's own, as in cam0_0001.png and cam1_0001.png."""
+    parts = [[[str(int(part)) for part in re.findall(r"\d+", Path(n).stem)] for n in names] for names in (left, right)]
+    while all(_shared(names) for names in parts):
+        parts = [[numbers[1:] for numbers in names] for names in parts]
+    return [["_".join(numbers) for numbers in names] for names in parts]
+
+
+def _shared(names: Sequence[Sequence[str]]) -> bool:
+    """Whether all names of a folder begin with one number, and have others."""
+    return len(names) > 1 and min(map(len, names)) > 1 and len({numbers[0] for numbers in names}) == 1
 
 
 def paired(left: Sequence[BoardView], right: Sequence[BoardView]) -> tuple[list[Pair], list[tuple[str, str]]]:
@@ -114,7 +123,8 @@ def paired(left: Sequence[BoardView], right: Sequence[BoardView]) -> tuple[list[
     CalibrationError
         Two pictures of one camera have one number, or too few have a counterpart.
     """
-    tables = [{number_of(view.name): view for view in views} for views in (left, right)]
+    keys = numbers_of([view.name for view in left], [view.name for view in right])
+    tables = [dict(zip(numbers, views, strict=True)) for numbers, views in zip(keys, (left, right), strict=True)]
     for table, views in zip(tables, (left, right), strict=True):
         if len(table) < len(views):
             found = f"{len(views)} pictures as {views[0].name} with {len(table)} numbers"
@@ -228,6 +238,9 @@ def _result(
             both[options.cameras[1]] = replace(
                 right, body_R=tuple(axes.ravel().tolist()), boresight_sigma_deg=left.boresight_sigma_deg
             )
+            if left.body_t:  # the right camera is where x_right = 0
+                centre = np.asarray(left.body_t) - axes @ place
+                both[options.cameras[1]] = replace(both[options.cameras[1]], body_t=tuple(centre.tolist()))
         return replace(known, cameras=both)
 
     order = (*names, *(f"turn_{a}" for a in "xyz"), *(f"shift_{a}" for a in "xyz"))

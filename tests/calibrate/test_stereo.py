@@ -10,7 +10,7 @@ from boards import BOARD, PHONE, exact_views, noisy, poses, render, theta_of
 from simulated import DATASETS, Coverage, real
 
 from smartnav_graph.calibrate.interior import calibrate_camera
-from smartnav_graph.calibrate.stereo import StereoOptions, calibrate_stereo, fit, number_of, paired
+from smartnav_graph.calibrate.stereo import StereoOptions, calibrate_stereo, fit, numbers_of, paired
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.so3 import exp, log
 from smartnav_graph.session.calibration.model import Calibration
@@ -76,7 +76,20 @@ def test_pairs_that_do_not_belong_together():
         paired([*left[:-1], replace(left[0], name="again_0.png")], right)
     both, alone = paired(left[:5], right)
     assert len(both) == 5 and [name for name, _ in alone] == [f"r{i}.png" for i in range(5, 12)]
-    assert number_of("left01.jpg") == number_of("Right_1.png") == "1"
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        (["left01.jpg", "left2.jpg"], ["Right_1.png", "Right_2.png"]),
+        (["cam0_0001.png", "cam0_0002.png"], ["cam1_0001.png", "cam1_0002.png"]),
+        (["2026_cam0_1.png", "2026_cam0_2.png"], ["2026_cam1_1.png", "2026_cam1_2.png"]),
+        (["10-59-58.png", "10-59-59.png"], ["10-59-59.png", "11-00-00.png"]),  # times of two hours
+    ],
+)
+def test_pictures_are_paired_by_numbers_that_differ_in_a_folder(left, right):
+    one, two = numbers_of(left, right)
+    assert one == two or set(one) & set(two) == {"10_59_59"}
 
 
 def test_pictures_of_two_cameras(tmp_path):
@@ -95,8 +108,14 @@ def test_pictures_of_two_cameras(tmp_path):
             value = result.values[name]
             assert abs(value.value - true) < 4.0 * value.sigma, name
     assert result.values["baseline"].value == pytest.approx(0.08, abs=1e-3)
-    known = Calibration(cameras={"cam0": replace(PHONE, body_R=tuple(np.eye(3).ravel()))})
-    assert np.allclose(np.reshape(result.change(known).cameras["cam1"].body_R, (3, 3)), exp(TURN).T, atol=0.01)
+    ahead, place = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([1.0, 2.0, 3.0])
+    known = Calibration(cameras={"cam0": replace(PHONE, body_R=tuple(ahead.ravel()), body_t=tuple(place))})
+    other = result.change(known).cameras["cam1"]
+    assert np.allclose(np.reshape(other.body_R, (3, 3)), ahead @ exp(TURN).T, atol=0.01)
+    body_x = place + ahead @ [0.3, -0.2, 2.0]  # of a point seen by both
+    seen = np.reshape(other.body_R, (3, 3)).T @ (body_x - other.body_t)
+    assert np.allclose(seen, exp(TURN) @ [0.3, -0.2, 2.0] + SHIFT, atol=0.01)
+    assert other.body_t[1] == pytest.approx(1.92, abs=0.01)  # 8 cm to the right
     with pytest.raises(CalibrationError, match="1 sources; expected two folders"):
         fit(folders[:1], StereoOptions(board=str(BOARD)))
 
