@@ -101,7 +101,7 @@ def fit(sources: Sequence[Path], options: StereoOptions) -> CalibrationResult:
     return _result(found, alone, options, [*left_out_lines(dropped), *warnings])
 
 
-def numbers_of(left: Sequence[str], right: Sequence[str]) -> list[list[str]]:
+def pair_numbers(left: Sequence[str], right: Sequence[str]) -> list[list[str]]:
     """The numbers of every file name of both folders, by which pictures are paired. Leading ones that all names of a
     folder share are left out: the camera's own, as in cam0_0001.png and cam1_0001.png."""
     parts = [[[str(int(part)) for part in re.findall(r"\d+", Path(n).stem)] for n in names] for names in (left, right)]
@@ -123,7 +123,7 @@ def paired(left: Sequence[BoardView], right: Sequence[BoardView]) -> tuple[list[
     CalibrationError
         Two pictures of one camera have one number, or too few have a counterpart.
     """
-    keys = numbers_of([view.name for view in left], [view.name for view in right])
+    keys = pair_numbers([view.name for view in left], [view.name for view in right])
     tables = [dict(zip(numbers, views, strict=True)) for numbers, views in zip(keys, (left, right), strict=True)]
     for table, views in zip(tables, (left, right), strict=True):
         if len(table) < len(views):

@@ -10,7 +10,7 @@ from boards import BOARD, PHONE, exact_views, noisy, poses, render, theta_of
 from simulated import DATASETS, Coverage, real
 
 from smartnav_graph.calibrate.interior import calibrate_camera
-from smartnav_graph.calibrate.stereo import StereoOptions, calibrate_stereo, fit, numbers_of, paired
+from smartnav_graph.calibrate.stereo import StereoOptions, calibrate_stereo, fit, pair_numbers, paired
 from smartnav_graph.core.errors import CalibrationError
 from smartnav_graph.core.so3 import exp, log
 from smartnav_graph.session.calibration.model import Calibration
@@ -88,7 +88,7 @@ def test_pairs_that_do_not_belong_together():
     ],
 )
 def test_pictures_are_paired_by_numbers_that_differ_in_a_folder(left, right):
-    one, two = numbers_of(left, right)
+    one, two = pair_numbers(left, right)
     assert one == two or set(one) & set(two) == {"10_59_59"}
 
 
