@@ -14,8 +14,8 @@ from pathlib import Path
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import replacing
 from smartnav_graph.graph.solution import Solution
-from smartnav_graph.output.export.coordinates import coordinates_in
-from smartnav_graph.output.export.geographic import write_geojson, write_gpx, write_kml
+from smartnav_graph.output.export.coordinates import coordinates_in, refuse_elsewhere
+from smartnav_graph.output.export.geographic import lla_of, write_geojson, write_gpx, write_kml
 from smartnav_graph.output.export.geopackage import write_geopackage
 from smartnav_graph.output.export.navigation import write_nmea, write_sbet
 from smartnav_graph.output.export.pictures import Geotags, export_pictures
@@ -54,8 +54,8 @@ def export(
     Raises
     ------
     SessionError
-        Unknown format or system; one that needs an origin or a date that the session does not have; the file exists;
-        the system refuses to write.
+        Unknown format or system, or a system of another place; one that needs an origin or a date that the session
+        does not have; the file exists; the system refuses to write.
     """
     if format not in FORMATS:
         raise SessionError("--format", f"{format!r}", f"one of {', '.join(FORMATS)}")
@@ -72,6 +72,8 @@ def export(
         )
     if format == "gpkg" and Path(path).suffix != ".gpkg":
         raise SessionError(path, "is no name of a GeoPackage", "NAME.gpkg", "other programs would not open it")
+    if crs is not None:
+        refuse_elsewhere(lla_of(solution), crs)
     with replacing(path, force=force) as file:
         if format in GEOGRAPHIC:
             GEOGRAPHIC[format](solution, file, clock_epoch == "unix")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats
@@ -9,6 +11,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.export.geographic import lla_of
 
+FARTHEST_DEG = 5.0  # of arc outside the area of use; national maps use one UTM zone for the zones beside it
 UNITS = {"metre": "m", "degree": "deg", "US survey foot": "us_ft", "foot": "ft"}
 
 
@@ -22,6 +25,43 @@ def coordinates_in(solution: Solution, crs: str) -> dict[str, Floats]:
         The system is not known, needs a grid that is not installed, or does not hold at the place.
     """
     return dict(zip(*transformed(lla_of(solution), crs), strict=True))
+
+
+def refuse_elsewhere(lla: Floats, crs: str) -> None:
+    """Refuse a system that is made for another place than geodetic rows lla (n, 3); one that is not known is left to
+    `transformed`.
+
+    Raises
+    ------
+    SessionError
+        A position lies more than `FARTHEST_DEG` outside the area of use.
+    """
+    import pyproj
+
+    try:
+        area = pyproj.CRS.from_user_input(crs).area_of_use
+    except pyproj.exceptions.ProjError:
+        return
+    if area is None:
+        return
+    outside = _outside_deg(lla, area.bounds)
+    worst = int(np.argmax(outside))
+    if outside[worst] > FARTHEST_DEG:
+        lat, lon = lla[worst, :2].tolist()
+        region = re.split("[.:;] ", area.name.rstrip("."))[0]  # without its list of states
+        found = f"is made for '{region}'; a position at {lat:.5f}, {lon:.5f} deg lies {outside[worst]:.0f} deg outside"
+        utm = (32600 if lat >= 0 else 32700) + int((lon + 180.0) // 6.0) % 60 + 1
+        raise SessionError(f"--crs {crs}", found, "a system of the place", f"such as EPSG:{utm}, its UTM zone")
+
+
+def _outside_deg(lla: Floats, bounds: tuple[float, float, float, float]) -> Floats:
+    """Degrees of arc (n,) by which positions lie outside west, south, east, north; 0 inside."""
+    west, south, east, north = bounds
+    lat, lon = lla[:, 0], lla[:, 1]
+    half = (east - west) % 360.0 / 2.0 if east - west < 360.0 else 180.0  # an area may cross 180 deg
+    from_middle = np.abs((lon - west - half + 180.0) % 360.0 - 180.0)
+    beside = np.maximum(from_middle - half, 0.0) * np.cos(np.radians(lat))
+    return np.hypot(beside, np.maximum(np.maximum(south - lat, lat - north), 0.0))
 
 
 def transformed(lla: Floats, crs: str) -> tuple[tuple[str, ...], tuple[Floats, Floats, Floats]]:

@@ -18,6 +18,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate_back
 from smartnav_graph.core.timebase import utc_from_gps
 from smartnav_graph.output.export import export
+from smartnav_graph.output.export.coordinates import refuse_elsewhere
 from smartnav_graph.session.streams import Imu
 
 UTM = "EPSG:25832"
@@ -128,6 +129,7 @@ def test_csv_has_coordinates_of_any_system(solution, lla, tmp_path):  # noqa: F8
         ("sbet", "boot", None, "no date"),
         ("nmea", "unknown", None, "no date"),
         ("csv", "unix", "EPSG:1", "cannot be used"),
+        ("csv", "unix", "EPSG:32616", "such as EPSG:32632, its UTM zone"),
         ("csv", "unix", "EPSG:5555", "geoid grid"),  # heights above the sea, without their grid
         ("gpkg", "unix", None, "is no name of a GeoPackage"),
         ("kml", "unix", UTM, "cannot be written as kml"),
@@ -142,3 +144,15 @@ def test_what_cannot_be_written_is_refused(solution, tmp_path, format, epoch, cr
 def test_coordinates_need_an_origin(tmp_path):
     with pytest.raises(SessionError, match="no origin"):
         export(make_solution(origin=None), "csv", tmp_path / "a.csv", crs=UTM)
+
+
+def test_a_system_holds_in_its_area_and_a_few_degrees_around():
+    """Norway uses zone 33 from coast to coast; zones 1 and 60 touch; the whole Earth is an area, too."""
+    place = np.array([[70.0, 31.0, 0.0]])
+    for crs, lat, lon in (("EPSG:32633", 70, 31), ("EPSG:32601", 9, 179), ("EPSG:3832", 0, -99), ("EPSG:4326", 0, 99)):
+        place[0, :2] = lat, lon
+        refuse_elsewhere(place, crs)
+    for crs, lat, lon in (("EPSG:32632", 40, -90), ("EPSG:32632", -20, 9), ("EPSG:3832", 0, 10)):
+        place[0, :2] = lat, lon
+        with pytest.raises(SessionError, match="such as EPSG:32"):
+            refuse_elsewhere(place, crs)
