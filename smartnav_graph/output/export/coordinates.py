@@ -61,7 +61,8 @@ def _outside_deg(lla: Floats, bounds: tuple[float, float, float, float]) -> Floa
     half = (east - west) % 360.0 / 2.0 if east - west < 360.0 else 180.0  # an area may cross 180 deg
     from_middle = np.abs((lon - west - half + 180.0) % 360.0 - 180.0)
     beside = np.maximum(from_middle - half, 0.0) * np.cos(np.radians(lat))
-    return np.hypot(beside, np.maximum(np.maximum(south - lat, lat - north), 0.0))
+    found: Floats = np.hypot(beside, np.maximum(np.maximum(south - lat, lat - north), 0.0))
+    return found
 
 
 def transformed(lla: Floats, crs: str) -> tuple[tuple[str, ...], tuple[Floats, Floats, Floats]]:
