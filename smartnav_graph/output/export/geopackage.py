@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.timebase import unix_ns
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.export.coordinates import transformed
 from smartnav_graph.output.export.geographic import SIGMAS, lla_of
@@ -50,8 +51,9 @@ def write_geopackage(solution: Solution, path: Path, clock_epoch: str, crs: str 
 def _columns(solution: Solution, clock_epoch: str) -> dict[str, NDArray[np.generic]]:
     heading, pitch, roll = solution.heading_pitch_roll_deg.T
     columns: dict[str, NDArray[np.generic]] = {"t_ns": solution.t_ns, "elapsed_s": solution.seconds}
-    if clock_epoch == "unix":
-        columns["time_utc"] = solution.t_ns.astype("datetime64[ns]").astype("datetime64[ms]")
+    unix = unix_ns(solution.t_ns, clock_epoch)
+    if unix is not None:
+        columns["time_utc"] = unix.astype("datetime64[ns]").astype("datetime64[ms]")
     columns |= dict(zip(SIGMAS, solution.sigmas[:, POS].T, strict=True))
     columns |= {"heading_deg": heading, "pitch_deg": pitch, "roll_deg": roll}
     columns |= {"sigma_heading_deg": solution.sigma_heading_deg}

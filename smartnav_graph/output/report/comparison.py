@@ -8,7 +8,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from smartnav_graph.core.files import replacing
-from smartnav_graph.core.timebase import NS
+from smartnav_graph.core.timebase import NS, unix_ns
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.report import reference, sections, track
@@ -46,8 +46,7 @@ def write_comparison_report(
     ]
     body = "\n".join(part for part in parts if part)
     ape = evaluation.ape_m
-    session = table_of(summary, "session")
-    is_unix = text_of(session, "clock_epoch") == "unix"
+    begin = unix_ns(solution.t0_ns, text_of(table_of(summary, "session"), "clock_epoch"))
     tiles = [("Epochs compared", str(evaluation.matched))]
     tiles += [("RMS position", metres(ape.rmse)), ("Largest", metres(ape.max))]
     if evaluation.rotation_deg is not None:
@@ -63,7 +62,7 @@ def write_comparison_report(
         sigma=Markup(""),
         contents=sections.contents(body),
     )
-    utc_ms = solution.t0_ns // 1_000_000 if is_unix else None
+    utc_ms = None if begin is None else int(begin) // 1_000_000
     page = whole_page(f"{name}: comparison", head, body, footer=f"{name}, comparison", utc_ms=utc_ms)
     with replacing(path) as new:
         new.write_text(page, encoding="utf-8")

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.frames import Origin
-from smartnav_graph.core.timebase import interpolate, seconds_since
+from smartnav_graph.core.timebase import interpolate, seconds_since, unix_ns
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.report.facts import Uncertainty, withheld_counts
@@ -75,8 +75,9 @@ def statistics_table(session: Session, solution: Solution, summary: Summary) -> 
 def _when_and_where(session: Session, solution: Solution) -> list[tuple[str, str]]:
     """Date and origin, where known."""
     rows = []
-    if session.clock_epoch == "unix" and len(solution):
-        stamp = np.datetime_as_string(np.datetime64(int(solution.t_ns[0]), "ns"), unit="s")
+    unix = unix_ns(solution.t_ns[:1], session.clock_epoch)
+    if unix is not None and len(unix):
+        stamp = np.datetime_as_string(np.datetime64(int(unix[0]), "ns"), unit="s")
         rows.append(("Begin (UTC)", str(stamp).replace("T", " ")))
     if solution.origin is not None:
         rows.append(("Origin of east, north, up", place_of(solution.origin)))

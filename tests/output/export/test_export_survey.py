@@ -16,7 +16,7 @@ from test_export import T0, lla, make_solution, solution  # noqa: F401
 from smartnav_graph import readers
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate_back
-from smartnav_graph.core.timebase import utc_from_gps
+from smartnav_graph.core.timebase import gps_from_utc, utc_from_gps
 from smartnav_graph.output.export import export
 from smartnav_graph.output.export.coordinates import refuse_elsewhere
 from smartnav_graph.session.streams import Imu
@@ -111,6 +111,13 @@ def test_geopackage_is_read_by_ogr(solution, lla, crs, tmp_path):  # noqa: F811
     with fiona.open(path, layer="trajectory") as layer:
         (line,) = layer
     assert len(line.geometry.coordinates) == len(solution)
+
+
+def test_geopackage_of_a_gps_clock_has_utc(solution, tmp_path):  # noqa: F811
+    gps = replace(solution, t_ns=np.asarray(gps_from_utc(solution.t_ns)))
+    export(gps, "gpkg", tmp_path / "a.gpkg", clock_epoch="gps")
+    with fiona.open(tmp_path / "a.gpkg", layer="epochs") as layer:
+        assert next(iter(layer)).properties["time_utc"].startswith("2025-06-01T10:00:00.123")
 
 
 def test_csv_has_coordinates_of_any_system(solution, lla, tmp_path):  # noqa: F811

@@ -15,12 +15,15 @@ from pyproj import Transformer
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config, ReportConfig, RunConfig
+from smartnav_graph.evaluation import evaluate
 from smartnav_graph.graph.solution import Residuals
 from smartnav_graph.output.report import write_report
 from smartnav_graph.output.report.about import check_shown
+from smartnav_graph.output.report.comparison import write_comparison_report
 from smartnav_graph.output.report.control_points import control_rows
+from smartnav_graph.output.report.statistics import statistics_table
 from smartnav_graph.session.session import Mount, Session
-from smartnav_graph.session.streams import ControlPoint
+from smartnav_graph.session.streams import ControlPoint, Reference
 
 BEGUN = 1_748_772_000 * 10**9 - T0  # 2025-06-01 10:00 UTC
 PIXEL = b"\x89PNG\r\n"  # what a picture holds is not looked at
@@ -185,6 +188,18 @@ def test_a_system_that_does_not_hold_there_is_seen_before_the_run(surveyed):
     check_shown(ReportConfig(crs="EPSG:25832"), surveyed.session)
     with pytest.raises(SessionError, match="geoid grid"):
         check_shown(ReportConfig(crs="EPSG:5555"), surveyed.session)
+
+
+@pytest.mark.parametrize("epoch", ["unix", "gps", "boot"])
+def test_pages_of_a_clock_with_dates_tell_utc(tmp_path, case, epoch):
+    """The report of a comparison, and the begin in the summary table."""
+    session, solution = dated(case, epoch).values()
+    truth, about = Reference(t_ns=solution.t_ns, enu=solution.nav_t_body), {"session": {"clock_epoch": epoch}}
+    found = evaluate(solution, truth)
+    write_comparison_report(tmp_path / "c.html", "run", solution, truth, found, about)
+    told = html.parse(tmp_path / "c.html").getroot().find("body").get("data-utc-ms")
+    assert told == (None if epoch == "boot" else "1748772000000")
+    assert ("2025-06-01 10:00:00" in statistics_table(session, solution, {}).html()) == (epoch != "boot")
 
 
 def test_forward_and_backward_are_compared(tmp_path, case):
