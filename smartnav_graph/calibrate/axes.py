@@ -17,6 +17,7 @@ Strapdown Inertial Navigation Technology, 8.3, for the lever arm.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -39,6 +40,7 @@ from smartnav_graph.session.session import Session
 WHERE = "calibrate axes"
 STEP_S, BLOCK_S = 0.02, 1.0
 OVERLAP_S = 10.0
+FEWEST = 30  # readings of each while both recorded, for up to 17 unknowns
 ALIKE, UNIQUE, APART_S = 0.7, 0.95, 1.0  # correlation of the lengths of rates; that of another lag over it; s between
 LEAST_SIGNAL = 5.0
 OPEN_DEG = 1.0  # sigma of an angle from which it is refused
@@ -94,17 +96,18 @@ def fit(sources: Sequence[Session], options: AxesOptions) -> CalibrationResult:
         Recordings that do not move together, a motion that leaves an axis of the gyro open, or readings in other units.
     """
     if options.turns:
-        return _result(by_turns(one_session(sources), options), check_readings(one_session(sources)))
+        return _result(by_turns(one_session(sources), options), check_readings(one_session(sources)), {})
     if len(sources) != 2:
         found = f"{len(sources)} recordings"
         expected = "two: the device, then the reference IMU; or one, with --turns"
         raise CalibrationError(WHERE, found, expected, "record both at once, or turn the device in a box")
     device, reference = sources
-    return _result(by_reference(device, reference), check_readings(device))
+    aligned, refused = by_reference(device, reference)
+    return _result(aligned, check_readings(device), refused)
 
 
-def by_reference(device: Session, reference: Session) -> dict[str, SensorAxes]:
-    """Of gyro, accelerometer and, where both have one, magnetometer."""
+def by_reference(device: Session, reference: Session) -> tuple[dict[str, SensorAxes], dict[str, str]]:
+    """Of gyro, accelerometer and, where both have one, magnetometer; and why a magnetometer is refused."""
     one, two = device.require_imu(), reference.require_imu()
     step = max(STEP_S, interval_s(one.t_ns), interval_s(two.t_ns))
     lag = _first_lag(_lengths(one.t_ns, one.gyro, step), _lengths(two.t_ns, two.gyro, step), step)
@@ -112,13 +115,31 @@ def by_reference(device: Session, reference: Session) -> dict[str, SensorAxes]:
     if device.magnetometer is not None and reference.magnetometer is not None:
         mine, theirs = device.magnetometer, reference.magnetometer
         streams["magnetometer"] = (mine.t_ns, mine.field_ut, theirs.t_ns, theirs.field_ut)
-    starts, found = (int(one.t_ns[0]), int(two.t_ns[0])), dict[str, SensorAxes]()
+    starts = (int(one.t_ns[0]), int(two.t_ns[0]))
+    found, refused = dict[str, SensorAxes](), dict[str, str]()
     drift, rates = 0.0, (two.t_ns, two.gyro)
     for sensor, parts in streams.items():
+        few = _too_few(sensor, parts, starts, lag)
+        if few and sensor == "magnetometer":
+            refused[sensor] = f"{few}; {MOVING}"
+            continue
+        if few:
+            raise CalibrationError(WHERE, few, f"at least {FEWEST}", MOVING)
         found[sensor] = _aligned(parts, starts, (lag, drift), step, rates if sensor == "accel" else None)
         if sensor == "gyro":
             lag, drift = found[sensor].lag_s, found[sensor].drift
-    return found
+    return found, refused
+
+
+def _too_few(sensor: str, parts: tuple[Times, Floats, Times, Floats], starts: tuple[int, int], lag: float) -> str:
+    """How many readings there are while both recorded, where they are too few or cover too short a time."""
+    t, u = (parts[0] - starts[0]) / NS, (parts[2] - starts[1]) / NS - lag
+    first, last = max(t.min(initial=np.inf), u.min(initial=np.inf)), min(t.max(initial=-np.inf), u.max(initial=-np.inf))
+    least = min(int(((one >= first) & (one <= last)).sum()) for one in (t, u))
+    if least < FEWEST:
+        return f"{least} readings of the {sensor} while both recorded"
+    short = last - first < OVERLAP_S / 2
+    return f"readings of the {sensor} in {last - first:.1f} s while both recorded" if short else ""
 
 
 def _lengths(t_ns: Times, rates: Floats, step: float) -> Floats:
@@ -252,11 +273,14 @@ def parse_turns(text: str) -> list[tuple[int, float]]:
     """Axis (0 to 2) and angle, rad, of each of "x:90,y:-90"."""
     found = []
     for part in text.split(","):
-        axis, _, angle = part.strip().partition(":")
+        axis, _, angle = part.strip().lower().partition(":")
         try:
-            found.append(("xyz".index(axis.lower()), float(np.radians(float(angle)))))
-        except ValueError as error:
-            raise ConfigError("--turns", repr(part), "axis:deg, as x:90,y:90,z:-90") from error
+            degrees = float(angle)
+        except ValueError:
+            degrees = math.nan
+        if axis not in ("x", "y", "z") or not math.isfinite(degrees):
+            raise ConfigError("--turns", repr(part), "axis:deg, as x:90,y:90,z:-90")
+        found.append(("xyz".index(axis), math.radians(degrees)))
     return found
 
 
@@ -298,9 +322,8 @@ def _turned(t_ns: Times, rates: Floats, first: int, last: int, rests: tuple[slic
     return np.asarray(whole if np.linalg.norm(whole - total) < 0.5 else total)  # a rotation vector is below 180 deg
 
 
-def _result(found: dict[str, SensorAxes], warnings: list[str]) -> CalibrationResult:
-    values = dict[str, Value]()
-    residuals, refused = dict[str, Residual](), dict[str, str]()
+def _result(found: dict[str, SensorAxes], warnings: list[str], refused: dict[str, str]) -> CalibrationResult:
+    values, residuals = dict[str, Value](), dict[str, Residual]()
     for sensor, axes in found.items():
         _check(sensor, axes, found, refused)
         if sensor in refused:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,9 @@ from simulated import Coverage
 from test_calibrate_imu import handled
 
 import smartnav_graph as sn
-from smartnav_graph.calibrate.axes import AxesOptions, fit
+from smartnav_graph.calibrate.axes import AxesOptions, fit, parse_turns
 from smartnav_graph.core.errors import CalibrationError, ConfigError
-from smartnav_graph.session.streams import Imu
+from smartnav_graph.session.streams import Imu, Magnetometer
 
 G = np.array([0.0, 0.0, 9.81])
 P = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # of the sensors in the device: x of the device along y
@@ -109,6 +110,25 @@ def test_what_the_motion_does_not_carry_is_refused():
         fit((device,), AxesOptions())
 
 
+@pytest.mark.parametrize(
+    ("rows", "text"),
+    [
+        (slice(1), "0 readings of the magnetometer"),
+        (slice(0, 3000, 1000), "3 readings"),
+        (slice(0, 200), r"in 2\.\d s while both"),
+    ],
+)
+def test_a_magnetometer_of_few_readings_is_refused_and_leaves_the_others(rows, text):
+    device, reference = (
+        one.replace(magnetometer=Magnetometer(t_ns=one.imu.t_ns, field_ut=one.imu.accel)) for one in plate(5)
+    )
+    assert not fit((device, reference), AxesOptions()).refused
+    few = device.replace(magnetometer=device.magnetometer.take(rows))
+    result = fit((few, reference), AxesOptions())
+    assert axes_of(result.values, "gyro") == [2, -1, 3] and len(result.order) == 6
+    assert list(result.refused) == ["magnetometer"] and re.search(text, result.refused["magnetometer"])
+
+
 TURNS = "x:90,y:90,z:-90,x:-90,z:90,y:-90,x:90,z:90"
 
 
@@ -157,3 +177,10 @@ def test_turns_that_do_not_match_the_recording():
         fit((boxed(2, plain),), AxesOptions(turns=plain))
     with pytest.raises(CalibrationError, match="24 rests"):
         fit((handled(1),), AxesOptions(turns=TURNS))
+
+
+@pytest.mark.parametrize("part", ["x:nan", "x:inf", ":90", "xy:90", "x", "x:"])
+def test_a_turn_is_one_axis_and_a_finite_angle(part):
+    with pytest.raises(ConfigError, match=f"{part}'; expected axis:deg"):
+        parse_turns(f"x:90,{part}")
+    assert parse_turns("Y: -90") == [(1, pytest.approx(-np.pi / 2))]
