@@ -14,7 +14,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.frames import LocalFrame, Origin
 from smartnav_graph.core.so3 import quaternion
-from smartnav_graph.core.timebase import seconds_since, span_text, unix_ns
+from smartnav_graph.core.timebase import NS, nearest, seconds_since, span_text, unix_ns
 from smartnav_graph.session.streams import Imu
 
 if TYPE_CHECKING:
@@ -64,6 +64,23 @@ class Residuals(Summarised):
     def of(self, sensor: str) -> NDArray[np.bool_]:
         """Mask of the rows of one sensor."""
         return np.asarray(self.sensor == sensor)
+
+    def found_for(self, sensor: str, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Masks (n,) of a sensor's measurements at t_ns (n,): those with residuals, and of these those in use.
+
+        Residuals have the stamps of keyframes, at or very near those of the measurements. Each belongs to the one
+        measurement nearest to it, within 0.4 median spacings; else to one that is not there.
+        """
+        rows = self.of(sensor)
+        at, used = self.t_ns[rows], self.used[rows]
+        stamps, row = np.unique(t_ns, return_inverse=True)
+        there, in_use = np.zeros((2, len(stamps)), dtype=bool)
+        if len(at) and len(stamps):
+            spacing = float(np.median(np.diff(stamps))) if len(stamps) > 1 else float(NS)
+            own = nearest(at, stamps)
+            close = np.abs(stamps[own] - at) <= max(0.4 * spacing, 1e6)
+            there[own[close]], in_use[own[close & used]] = True, True
+        return there[row], in_use[row]
 
     def sensors(self) -> list[str]:
         """Names of the sensors with residuals, sorted."""

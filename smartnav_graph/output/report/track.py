@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.timebase import nearest
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Residuals, Solution
 from smartnav_graph.output.report.svg import Axis, Plot, legend, round_step, ticked
@@ -28,8 +27,8 @@ NARROW_PX, WIDE_PX = 290.0, 600.0  # width of the map on a phone, on a screen an
 def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, NDArray[np.str_]]]:
     """Per position sensor: rows (n, 2) east, north and whether each was ``used``, ``rejected`` or ``unused``.
 
-    Residual rows belong to the fix nearest to them (their stamps are those of keyframes, which are those of the fixes
-    or very near); a fix that no row belongs to is unused. Without residuals every fix inside the run counts as used.
+    A fix without residuals of its own is unused (`Residuals.found_for`). Without any every fix inside the run counts as
+    used.
     """
     found = {}
     for name, stream in session.positions().items():
@@ -43,18 +42,10 @@ def fix_states(session: Session, solution: Solution) -> dict[str, tuple[Floats, 
 
 
 def _states(stream: Positioned, name: str, residuals: Residuals) -> NDArray[np.str_]:
-    rows = residuals.of(name) if len(residuals) else np.zeros(0, dtype=bool)
-    if not rows.any():
-        return np.full(len(stream), "used" if not len(residuals) else "unused")
-    at, used = residuals.t_ns[rows], residuals.used[rows]
-    stamps, row = np.unique(stream.t_ns, return_inverse=True)
-    spacing = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e9
-    own = nearest(at, stamps)
-    close = np.abs(stamps[own] - at) <= max(spacing / 4, 1e6)  # else of a fix before or after the run
-    states = np.full(len(stamps), "unused", dtype="U8")
-    states[own[close & ~used]] = "rejected"
-    states[own[close & used]] = "used"
-    return np.asarray(states[row])
+    if not len(residuals):
+        return np.full(len(stream), "used")
+    there, used = residuals.found_for(name, stream.t_ns)
+    return np.where(used, "used", np.where(there, "rejected", "unused"))
 
 
 def _axes(points: Floats) -> tuple[Axis, Axis, float]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smartnav_graph.core.arrays import Times
-from smartnav_graph.core.timebase import NS, Gap, find_gaps, nearest, ns_from_seconds
-from smartnav_graph.graph.solution import Residuals, Solution
+from smartnav_graph.core.timebase import NS, Gap, find_gaps, ns_from_seconds
+from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.summary_json import GAP_KINDS, Summary, imu_gaps, standstill_spans
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
@@ -84,25 +84,11 @@ def gap_spans(session: Session, summary: Summary) -> list[Gap]:
 
 
 def fix_use(fixes: Stream, solution: Solution | None) -> NDArray[np.int64]:
-    """USED, REJECTED or WITHHELD for every row of positions, by the residual nearest in time (n,).
-
-    Residuals may be on the IMU clock and fixes on the receiver's, with a time offset between them: a residual belongs
-    to a fix within 0.4 fix periods.
-    """
-    use = np.full(len(fixes), USED, dtype=np.int64)
-    rows: Residuals | None = None if solution is None else solution.residuals
-    mine = np.zeros(0, dtype=bool) if rows is None else rows.of(fixes.NAME)
-    if rows is None or not mine.any():
-        return use
-    order = np.argsort(rows.t_ns[mine], kind="stable")
-    t, used = rows.t_ns[mine][order], rows.used[mine][order]
-    i = nearest(fixes.t_ns, t)
-    left, right = np.searchsorted(t, t[i], "left"), np.searchsorted(t, t[i], "right")
-    count = np.concatenate([[0], np.cumsum(used)])
-    use[count[right] == count[left]] = REJECTED
-    period = float(np.median(np.diff(fixes.t_ns))) if len(fixes) > 1 else float(NS)
-    use[np.abs(fixes.t_ns - t[i]) > 0.4 * period] = WITHHELD
-    return use
+    """USED, REJECTED or WITHHELD for every row of positions, by its residuals (n,); USED without any of the sensor."""
+    if solution is None or not solution.residuals.of(fixes.NAME).any():
+        return np.full(len(fixes), USED, dtype=np.int64)
+    there, used = solution.residuals.found_for(fixes.NAME, fixes.t_ns)
+    return np.where(used, USED, np.where(there, REJECTED, WITHHELD)).astype(np.int64)
 
 
 def outages(t_ns: Times, start_ns: int, end_ns: int, *, periods: float = 3.0, least_s: float = 1.0) -> list[Gap]:

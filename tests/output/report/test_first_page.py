@@ -156,6 +156,8 @@ def test_visits_close_to_one_another_are_told_apart(surveyed):
     session = surveyed.session.replace(control=points)
     rows = control_rows(session, replace(surveyed.solution, residuals=residuals), surveyed.summary)
     assert [row.use for row in rows] == ["in", "in", "withheld", "rejected", "in", "in"]
+    there, _ = residuals.found_for("control", at)  # as the recording and the map ask
+    assert there.tolist() == [True, True, False, True, True, True]
 
 
 def test_a_withheld_point_far_off_is_named(tmp_path, surveyed):
