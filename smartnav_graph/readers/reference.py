@@ -22,6 +22,7 @@ from smartnav_graph.core.errors import ConfigError, SessionError, warn
 from smartnav_graph.core.files import read_table, read_toml
 from smartnav_graph.core.so3 import from_quaternion, quaternion
 from smartnav_graph.core.timebase import NS
+from smartnav_graph.readers.archive import is_archive
 from smartnav_graph.readers.robotics.ros_poses import is_bag, pose_columns_of_bag
 from smartnav_graph.readers.source import vector_columns
 from smartnav_graph.readers.text import TextTable, first_lines, read_text
@@ -89,17 +90,20 @@ def load_trajectory(
 ) -> Reference:
     """A trajectory of another program, to be compared: as `load_reference`, where `times` and `body_T_ref` count for
     KITTI poses only."""
-    lines = first_lines(Path(path)) if Path(path).is_file() and not is_bag(path) else []
+    is_text = Path(path).is_file() and not is_bag(path) and not is_archive(Path(path))
+    lines = first_lines(Path(path)) if is_text else []
     is_kitti = bool(lines) and _is_numbers(lines[0], 12)
     return load_reference(path, times=times, body_T_ref=body_T_ref) if is_kitti else load_reference(path)
 
 
 def _is_log(path: Path) -> bool:
-    """Whether it is the folder of a log of another program."""
-    from smartnav_graph.readers import READERS
+    """Whether it is an archive, or the folder of a log of another program."""
+    from smartnav_graph.readers import known_readers
 
+    if is_archive(path):
+        return True
     ours = any((path / name).is_file() for name in ("reference.parquet", "session.toml"))
-    return path.is_dir() and not ours and any(reader.matches(str(path)) for reader in READERS.values())
+    return path.is_dir() and not ours and any(reader.matches(str(path)) for reader in known_readers().values())
 
 
 def _of_log(path: Path) -> Table:

@@ -1,5 +1,7 @@
 """Reference trajectories: every format gives the same poses, in the frame the definitions ask for."""
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,7 @@ from smartnav_graph import readers
 from smartnav_graph.core.errors import ConfigError, SessionError
 from smartnav_graph.core.timebase import interpolate
 from smartnav_graph.evaluation.align import fit_alignment
-from smartnav_graph.readers.reference import load_reference, load_transform
+from smartnav_graph.readers.reference import load_reference, load_trajectory, load_transform
 from smartnav_graph.session.folder import save
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Reference
@@ -266,6 +268,16 @@ def test_ground_truth_of_a_euroc_folder_is_the_reference(tmp_path):
     found = load_reference(tmp_path)
     np.testing.assert_array_equal(found.enu, [[1, 2, 3], [1.5, 2, 3]])
     np.testing.assert_array_equal(found.t_ns, [5_000_000, 10_000_000])
+    archive = shutil.make_archive(str(tmp_path / "log"), "zip", tmp_path, "mav0")
+    for load in (load_reference, load_trajectory):
+        np.testing.assert_array_equal(load(archive).enu, found.enu)
+
+
+def test_a_folder_that_a_reader_of_another_package_knows(tmp_path, monkeypatch):
+    kept = Session(reference=Reference(t_ns=np.array([1, 2]), enu=np.array([[1.0, 2, 3], [4, 5, 6]])))
+    reader = readers.Reader("own", "", "", lambda source: source == str(tmp_path), lambda *_: kept)
+    monkeypatch.setattr(readers, "known_readers", lambda: {"own": reader})
+    np.testing.assert_array_equal(load_reference(tmp_path).enu, kept.reference.enu)
 
 
 def test_rows_that_may_be_cut_are_said(tmp_path, warned):
