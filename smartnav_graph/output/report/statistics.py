@@ -44,7 +44,7 @@ def key_figures(summary: Summary, uncertainty: Uncertainty | None) -> list[tuple
     tiles = [
         ("Duration", duration(summary.get("duration_s"))),
         ("Distance", distance(summary.get("path_m"))),
-        ("Median 1 sigma", metres(uncertainty.median_m) if uncertainty else "–"),
+        ("Median 1 sigma, horizontal", metres(uncertainty.median_m) if uncertainty else "–"),
         ("χ² / dof", number(table_of(summary, "chi2_per_dof").get("overall"))),
     ]
     if table_of(summary, "rejected"):

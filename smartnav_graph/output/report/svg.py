@@ -255,7 +255,7 @@ class Plot:
 
     def render(self) -> str:
         """The ``<svg>`` element."""
-        size = f"aspect-ratio:{self.aspect:.4f}" if self.aspect else f"height:{self.height_px}px"
+        size = f"--aspect:{self.aspect:.4f};aspect-ratio:var(--aspect)" if self.aspect else f"height:{self.height_px}px"
         kind = "plot" if self.x_title else "plot above"
         titles = (
             f'<text class="title ty0" x="-48" y="-13">{escape(self.y.titled(self.y_title))}</text>'

@@ -19,6 +19,7 @@ from drive_case import Drive, drive
 from playwright import sync_api
 
 from smartnav_graph.cli import main
+from smartnav_graph.estimate.config import Config, ReportConfig
 from smartnav_graph.output.report import write_report
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
@@ -158,6 +159,24 @@ def test_print_shows_what_the_screen_folds(browser: Any, kitti_run: Path) -> Non
     tab.emulate_media(media="print")
     assert row.is_visible() and tab.locator(".options dd").first.is_visible() and tab.locator(".sign").is_visible()
     assert tab.evaluate("document.documentElement.scrollWidth") <= 700
+    tab.close()
+
+
+@pytest.mark.parametrize("reasons", [1, 4, 10])
+def test_map_and_first_facts_are_on_the_first_sheet(browser: Any, case: Drive, tmp_path: Path, reasons: int) -> None:
+    """However many reasons the verdict has; labels of the small map do not cover each other."""
+    text = "heights of the fixes are 4.2 m off those of the control points from 120 s to 180 s"
+    reason = {"level": "doubtful", "sensor": "gnss", "start_s": None, "text": text, "remedy": "convert one of them"}
+    summary = case.summary | {"verdict": {"level": "doubtful", "reasons": [reason] * reasons}}
+    config = Config(report=ReportConfig(company="Surveyors", time_zone="Europe/Berlin", crs="EPSG:25832"))
+    write_report(tmp_path / "r.html", session=case.session, solution=case.solution, summary=summary, config=config)
+    tab = browser.new_page(viewport={"width": 688, "height": 1000})  # A4 less the margins, px
+    tab.goto((tmp_path / "r.html").resolve().as_uri())
+    tab.emulate_media(media="print")
+    bottom = "q => document.querySelector(q).getBoundingClientRect().bottom"
+    assert tab.evaluate(bottom, "#map figure") <= 1000
+    assert tab.evaluate(bottom, "#about .facts div") <= 1000
+    assert overlaps(tab.evaluate(TEXTS)) == []
     tab.close()
 
 
