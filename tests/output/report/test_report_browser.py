@@ -164,7 +164,7 @@ def test_print_shows_what_the_screen_folds(browser: Any, kitti_run: Path) -> Non
 
 @pytest.mark.parametrize("reasons", [1, 4, 10])
 def test_map_and_first_facts_are_on_the_first_sheet(browser: Any, case: Drive, tmp_path: Path, reasons: int) -> None:
-    """However many reasons the verdict has; labels of the small map do not cover each other."""
+    """With many reasons of the verdict, too; labels of the small map do not cover each other."""
     text = "heights of the fixes are 4.2 m off those of the control points from 120 s to 180 s"
     reason = {"level": "doubtful", "sensor": "gnss", "start_s": None, "text": text, "remedy": "convert one of them"}
     summary = case.summary | {"verdict": {"level": "doubtful", "reasons": [reason] * reasons}}
