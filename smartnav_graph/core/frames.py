@@ -24,6 +24,12 @@ _AXES = {
     sign + name: (1.0 if sign == "+" else -1.0) * np.eye(3)[i] for i, name in enumerate("xyz") for sign in ("+", "-")
 }
 
+# What heights of a result count from.
+ELLIPSOIDAL = "ellipsoidal (WGS84)"
+ABOVE_SEA = "above mean sea level (geoid not known)"
+PARTLY_ABOVE_SEA = "partly above mean sea level (geoid not known)"
+LOCAL_HEIGHTS = "above the local origin"
+
 
 @dataclass(frozen=True)
 class Origin:

@@ -109,7 +109,8 @@ class Solution(Summarised):
     position, velocity (nav axes), accelerometer bias, gyroscope bias (body axes). The rotation error is the nav-axes
     vector theta of R_true = Exp(theta) R. `t0_ns` is the session's time zero, `origin` its local frame,
     `clock_epoch` that of the stamps (``unix``, ``gps``, ``boot``, ``unknown``). `imu` is the inertial
-    stream that carries the states from epoch to epoch, under `gravity` m/s^2; None where it is not known.
+    stream that carries the states from epoch to epoch, under `gravity` m/s^2; None where it is not known. `heights`
+    says what the geodetic heights count from.
     """
 
     t_ns: NDArray[np.int64]
@@ -127,6 +128,7 @@ class Solution(Summarised):
     imu: Imu | None = None
     gravity: float = frames.STANDARD_GRAVITY
     clock_epoch: str = "unknown"
+    heights: str = frames.ELLIPSOIDAL
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -263,6 +265,7 @@ def from_columns(
     imu: Imu | None = None,
     gravity: float = frames.STANDARD_GRAVITY,
     clock_epoch: str = "unknown",
+    heights: str = frames.ELLIPSOIDAL,
 ) -> Solution:
     """The inverse of `Solution.all_columns`."""
 
@@ -292,4 +295,5 @@ def from_columns(
         imu=imu,
         gravity=gravity,
         clock_epoch=clock_epoch,
+        heights=heights,
     )

@@ -25,7 +25,7 @@ from smartnav_graph.core import figures
 from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import read_table, refuse_existing, refuse_foreign, replacing, write_table
-from smartnav_graph.core.frames import Origin
+from smartnav_graph.core.frames import ELLIPSOIDAL, Origin
 from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.estimate import config as config_model
 from smartnav_graph.estimate.both_ways import BothWays
@@ -166,6 +166,7 @@ def _session_key(run: Run) -> dict[str, object]:
     return {
         "source": None if session.path is None else str(session.path),
         "clock_epoch": session.clock_epoch,
+        "heights": solution.heights,
         "t0_ns": solution.t0_ns,
         "forward": solution.forward,
         "up": solution.up,
@@ -332,6 +333,7 @@ def _frame(session: Mapping[str, Any], imu: Path) -> dict[str, Any]:
     origin = None if session["origin"] is None else Origin(**session["origin"])
     found: dict[str, Any] = {"t0_ns": int(session["t0_ns"]), "origin": origin}
     found["clock_epoch"] = text_of(session, "clock_epoch") or "unknown"
+    found["heights"] = text_of(session, "heights") or ELLIPSOIDAL
     if imu.is_file():
         found |= {"imu": Imu.from_columns(read_table(imu)), "gravity": float(session["gravity_m_s2"])}
     return found | {key: str(session[key]) for key in ("forward", "up")}

@@ -286,6 +286,18 @@ class Session(Summarised, Streams):
         return self.frame.nav_from_lla(rows)
 
     @property
+    def heights(self) -> str:
+        """What the heights of the positions, and so of a result, count from."""
+        if self.origin is None:
+            return frames.LOCAL_HEIGHTS
+        known = [name for name, rows in self.positions().items() if rows.lla is not None and rows.has_height.any()]
+        mounts = [self.mount(name) for name in known]
+        above_sea = [mount.above_sea and not np.isfinite(mount.geoid_m) for mount in mounts]
+        if not any(above_sea):
+            return frames.ELLIPSOIDAL
+        return frames.ABOVE_SEA if all(above_sea) else frames.PARTLY_ABOVE_SEA
+
+    @property
     def gravity(self) -> float:
         """Magnitude of gravity m/s^2: the session's own, else normal gravity at the origin, else the standard value."""
         if self.gravity_m_s2 is not None:

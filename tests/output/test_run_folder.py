@@ -19,6 +19,7 @@ from smartnav_graph.estimate import config
 from smartnav_graph.output import rerun_log
 from smartnav_graph.output.run_folder import check_out, config_differences, plain, read_run, recorded, write_run
 from smartnav_graph.session.calibration import model as calibration_model
+from smartnav_graph.session.session import Mount
 
 OPTIONS = {"end_s": 20.0, "initial": "0,0,0,0,3,30"}
 
@@ -74,6 +75,12 @@ def test_a_session_without_origin_reads_back_without_one(session, tmp_path):
     assert read_run(tmp_path / "run").solution.origin is None
     with (tmp_path / "run" / "trajectory.csv").open() as file:
         assert {row["lat_deg"] for row in csv.DictReader(file)} == {""}
+
+
+def test_heights_above_the_sea_are_known_to_the_folder(session, tmp_path):
+    run = sn.run(session.replace(sensors={"gnss": Mount(frame="msl")}), **OPTIONS)
+    write_run(run, tmp_path / "run", report=False, recording=False)
+    assert read_run(tmp_path / "run").solution.heights == "above mean sea level (geoid not known)"
 
 
 def test_withheld_rows_give_the_figures_of_the_summary(run, tmp_path):

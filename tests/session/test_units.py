@@ -9,6 +9,7 @@ import pytest
 
 import smartnav_graph as sn
 from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.frames import ABOVE_SEA, ELLIPSOIDAL, PARTLY_ABOVE_SEA
 from smartnav_graph.core.timebase import ns_from_seconds
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.problem import prepare
@@ -16,7 +17,7 @@ from smartnav_graph.session import folder
 from smartnav_graph.session.health import inspect
 from smartnav_graph.session.health.units import in_right_units
 from smartnav_graph.session.session import Mount
-from smartnav_graph.session.streams import GnssFix
+from smartnav_graph.session.streams import ControlPoint, GnssFix
 
 DEG, G = 180.0 / np.pi, 9.80665
 
@@ -155,10 +156,14 @@ def test_heights_above_the_sea_need_the_geoid_and_are_lifted_by_it(tmp_path):
     above_sea = session.replace(gnss=replace(session.gnss, lla=lla), sensors={"gnss": Mount(frame="msl")})
     warning = next(text for text in prepare(above_sea, Config()).warnings if "geoid" in text)
     assert "so are those of the result; for heights above the ellipsoid give geoid_m" in warning
+    point = ControlPoint(t_ns=session.gnss.t_ns[:1], lla=lla[:1], point_id=np.array(["A"], dtype=object))
+    both = above_sea.replace(control=point)
+    assert [one.heights for one in (session, above_sea, both)] == [ELLIPSOIDAL, ABOVE_SEA, PARTLY_ABOVE_SEA]
     folder.save(above_sea, tmp_path / "t")
     again = folder.load(tmp_path / "t")
     assert again.mount("gnss").above_sea and np.isnan(again.mount("gnss").geoid_m)
     folder.save(above_sea.replace(sensors={"gnss": Mount(frame="msl", geoid_m=46.5)}), tmp_path / "s")
     known = folder.load(tmp_path / "s")
     np.testing.assert_allclose(known.nav_position(known.gnss), session.nav_position(session.gnss), atol=1e-6)  # m
+    assert known.heights == ELLIPSOIDAL
     prepare(known, Config())

@@ -100,6 +100,7 @@ def _solution(problem: Problem, t_ns: NDArray[np.int64], states: Kinematics, cov
         imu=problem.imu,
         gravity=session.gravity,
         clock_epoch=session.clock_epoch,
+        heights=session.heights,
     )
 
 

@@ -2,8 +2,8 @@
 their position.
 
 Geographic formats need an origin. Their times are absolute only where the clock counts from the Unix epoch; otherwise
-the files have seconds since time zero. Their description says so, and that heights are ellipsoidal (WGS84): KML and
-GPX programs take them for heights above sea level.
+the files have seconds since time zero. Their description says so, and what heights count from: KML and GPX
+programs take them for heights above sea level. Formats without a description warn of heights that are not ellipsoidal.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.files import replacing
 from smartnav_graph.graph.solution import Solution
 from smartnav_graph.output.export.coordinates import coordinates_in, refuse_elsewhere
-from smartnav_graph.output.export.geographic import lla_of, write_geojson, write_gpx, write_kml
+from smartnav_graph.output.export.geographic import lla_of, warn_of_heights, write_geojson, write_gpx, write_kml
 from smartnav_graph.output.export.geopackage import write_geopackage
 from smartnav_graph.output.export.navigation import write_nmea, write_sbet
 from smartnav_graph.output.export.pictures import Geotags, export_pictures
@@ -31,6 +31,7 @@ GEOGRAPHIC: dict[str, Callable[[Solution, Path, bool], None]] = {
 DATED: dict[str, Callable[[Solution, Path, str], None]] = {"sbet": write_sbet, "nmea": write_nmea}
 FORMATS = ("tum", "kml", "geojson", "gpx", "csv", "sbet", "nmea", "gpkg")
 IN_ANY_CRS = ("csv", "gpkg")
+UNDESCRIBED = ("csv", "gpkg", "sbet")  # formats that cannot say what heights count from
 
 
 def export(
@@ -85,3 +86,5 @@ def export(
             write_trajectory_csv(solution, file, {} if crs is None else coordinates_in(solution, crs))
         else:
             write_tum(solution, file)
+    if format in UNDESCRIBED:
+        warn_of_heights(solution, f"--format {format}" if crs is None else f"--crs {crs}")

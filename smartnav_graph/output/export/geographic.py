@@ -1,4 +1,4 @@
-"""KML, GPX and GeoJSON: latitude, longitude, ellipsoidal height; time and one sigma of every point where known.
+"""KML, GPX and GeoJSON: latitude, longitude, height; time and one sigma of every point where known.
 
 Sources: OGC 12-007r2 KML 2.3 (gx:Track); TopoGrafix, GPX 1.1 schema; RFC 7946 (GeoJSON).
 """
@@ -14,7 +14,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from smartnav_graph.core.arrays import Floats, Times
-from smartnav_graph.core.frames import LocalFrame
+from smartnav_graph.core.errors import warn
+from smartnav_graph.core.frames import ELLIPSOIDAL, LocalFrame
 from smartnav_graph.graph.solution import POS, Solution
 
 Rows = list[list[float]]
@@ -164,6 +165,13 @@ def lla_of(solution: Solution) -> Floats:
     return LocalFrame(solution.origin).lla_from_nav(solution.nav_t_body)
 
 
+def warn_of_heights(solution: Solution, where: str) -> None:
+    """Warn of heights that are not above the ellipsoid, for files that do not say so."""
+    if solution.origin is not None and solution.heights != ELLIPSOIDAL:
+        remedy = "for ellipsoidal heights give geoid_m in [sensors.NAME] of session.toml and smooth again"
+        warn(f"{where}: heights are {solution.heights}, and are written as they are; {remedy}")
+
+
 def utc(t_ns: Times) -> list[str]:
     """ISO 8601 in UTC of Unix nanoseconds, truncated to microseconds (which other programs read)."""
     text: list[str] = np.datetime_as_string(t_ns.astype("datetime64[ns]"), unit="us").tolist()
@@ -180,7 +188,7 @@ def _description(solution: Solution, absolute_time: bool) -> str:
     clock = "times are UTC" if absolute_time else "no absolute time: the session's clock has no Unix epoch"
     return (
         f"{len(solution)} epochs over {solution.seconds[-1] - solution.seconds[0]:.3f} s; {clock}; time zero is "
-        f"{solution.t0_ns} ns on the session's clock; heights are ellipsoidal (WGS84); one sigma horizontal: median "
+        f"{solution.t0_ns} ns on the session's clock; heights are {solution.heights}; one sigma horizontal: median "
         f"{np.median(horizontal):.3f} m, largest {horizontal.max():.3f} m; vertical: median "
         f"{np.median(vertical):.3f} m, largest {vertical.max():.3f} m"
     )

@@ -6,7 +6,7 @@ east, down; roll, pitch, heading rad; the azimuth of the frame of velocities, ze
 removed, and angular rate rad/s, forward, right, down (zero where the run holds no inertial data).
 
 NMEA: GGA of quality 6 (estimated), RMC, GST, and THS (true heading). Heights are ellipsoidal, and the geoid separation
-is zero.
+is zero; it is empty where heights are above mean sea level.
 """
 
 from __future__ import annotations
@@ -82,6 +82,7 @@ def _sentences(solution: Solution, t_ns: Times) -> Iterator[str]:
     speed = (np.linalg.norm(solution.nav_v_body[:, :2], axis=1) * KNOTS).tolist()
     course = (np.degrees(np.arctan2(*solution.nav_v_body[:, :2].T)) % 360.0).tolist()
     sigma = solution.sigmas[:, POS].tolist()
+    separation = "0.0" if solution.heights == frames.ELLIPSOIDAL else ""
     for row, stamp in enumerate(((t_ns + 500_000) // 1_000_000).tolist()):
         seconds, ms = divmod(stamp, 1000)
         when = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
@@ -89,7 +90,7 @@ def _sentences(solution: Solution, t_ns: Times) -> Iterator[str]:
         lat, lon, height = lla[row]
         place = f"{_degrees(lat, 2, 'NS')},{_degrees(lon, 3, 'EW')}"
         e, n, u = sigma[row]
-        yield _closed(f"GPGGA,{at},{place},6,,,{height:.4f},M,0.0,M,,")
+        yield _closed(f"GPGGA,{at},{place},6,,,{height:.4f},M,{separation},M,,")
         yield _closed(f"GPRMC,{at},A,{place},{speed[row]:.3f},{_turn(course[row], 2)},{when:%d%m%y},,,E")
         yield _closed(f"GPGST,{at},,,,,{n:.4f},{e:.4f},{u:.4f}")
         yield _closed(f"GPTHS,{_turn(heading[row], 3)},E")

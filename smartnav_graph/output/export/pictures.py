@@ -32,6 +32,7 @@ from smartnav_graph.core.timebase import interpolate, ns_from_seconds, seconds_s
 from smartnav_graph.factors.context import camera_name
 from smartnav_graph.graph.solution import POS, Solution
 from smartnav_graph.output.export.exif import with_exif
+from smartnav_graph.output.export.geographic import warn_of_heights
 from smartnav_graph.output.summary_json import Summary, list_of, table_of
 from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Session
@@ -127,6 +128,7 @@ def export_pictures(
             else:
                 rows.append((picture, place))
         _table(rows, folder / TABLE)
+    warn_of_heights(solution, "--format images")
     return Geotags(len(rows), {reason: n for reason, n in left_out.items() if n})
 
 

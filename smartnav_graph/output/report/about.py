@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from smartnav_graph.core.errors import SessionError
-from smartnav_graph.core.frames import LocalFrame
+from smartnav_graph.core.frames import ELLIPSOIDAL, LOCAL_HEIGHTS, LocalFrame
 from smartnav_graph.core.timebase import NS, utc_from_gps
 from smartnav_graph.estimate.config import LOGOS, Config, ReportConfig
 from smartnav_graph.factors import title_of
@@ -115,8 +115,8 @@ def _name_of(crs: str) -> str:
 
 
 def _heights(session: Session, solution: Solution) -> list[str]:
-    above = "above the ellipsoid WGS 84" if solution.origin is not None else "above the local origin"
-    lines = [f"Results: {above}"]
+    above = LOCAL_HEIGHTS if solution.origin is None else solution.heights
+    lines = [f"Results: {'above the ellipsoid WGS 84' if above == ELLIPSOIDAL else above}"]
     for name, stream in session.positions().items():
         mount = session.mount(name)
         if isinstance(stream, Positioned) and mount.above_sea:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from smartnav_graph.core.arrays import Floats, Times
+from smartnav_graph.core.frames import ELLIPSOIDAL, LOCAL_HEIGHTS
 from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.evaluation import Evaluation
 from smartnav_graph.factors import title_of
@@ -97,7 +98,8 @@ def motion(solution: Solution, gaps: Intervals) -> str:
     fast.line(t, speed, "s0")
     known = solution.origin is not None
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
-    title = "Height above the ellipsoid [m]" if known else "Height above the local origin [m]"
+    above = solution.heights if known else LOCAL_HEIGHTS
+    title = f"Height {'above the ellipsoid' if above == ELLIPSOIDAL else above} [m]"
     sigma = solution.sigmas[:, POS][:, 2]
     band = core(np.concatenate([height - sigma, height + sigma]))
     whole = np.ptp(band) < 10 * max(float(np.ptp(height)), 1.0) if len(band) else False

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from smartnav_graph.core.arrays import Floats
-from smartnav_graph.core.frames import Origin
+from smartnav_graph.core.frames import LOCAL_HEIGHTS, Origin
 from smartnav_graph.core.timebase import interpolate, seconds_since, unix_ns
 from smartnav_graph.factors import title_of
 from smartnav_graph.graph.solution import POS, Solution
@@ -110,7 +110,7 @@ def _motion(solution: Solution) -> list[tuple[str, str]]:
     fastest = int(np.argmax(speed))
     known = solution.origin is not None
     height = solution.trajectory_columns()["height_m"] if known else solution.nav_t_body[:, 2]
-    above = "ellipsoidal" if known else "above the local origin"
+    above = solution.heights.removesuffix(" (WGS84)") if known else LOCAL_HEIGHTS
     largest = f"{number(speed[fastest])} m/s ({fixed(3.6 * speed[fastest], 0)} km/h) at {fixed(t[fastest], 1)} s"
     heights = f"{fixed(height.min(), 2)} to {fixed(height.max(), 2)} m"
     return [("Largest speed", largest), (f"Height, {above}", heights)]

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from test_export import T0, lla, make_solution, solution  # noqa: F401
 
 from smartnav_graph import readers
-from smartnav_graph.core.errors import SessionError
+from smartnav_graph.core.errors import SessionError, SmartnavWarning
+from smartnav_graph.core.frames import ABOVE_SEA
 from smartnav_graph.core.so3 import rotate_back
 from smartnav_graph.core.timebase import gps_from_utc, utc_from_gps
 from smartnav_graph.output.export import export
@@ -151,6 +152,19 @@ def test_what_cannot_be_written_is_refused(solution, tmp_path, format, epoch, cr
 def test_coordinates_need_an_origin(tmp_path):
     with pytest.raises(SessionError, match="no origin"):
         export(make_solution(origin=None), "csv", tmp_path / "a.csv", crs=UTM)
+
+
+def test_heights_above_the_sea_are_named_by_every_format(solution, tmp_path):  # noqa: F811
+    sea = replace(solution, heights=ABOVE_SEA)
+    for name in ("kml", "gpx", "geojson"):
+        export(sea, name, tmp_path / name)
+        assert "heights are above mean sea level (geoid not known)" in (tmp_path / name).read_text()
+    for name, crs, where in (("sbet", None, "--format sbet"), ("csv", UTM, f"--crs {UTM}")):
+        with pytest.warns(SmartnavWarning, match=f"{where}: heights are above mean sea level"):
+            export(sea, name, tmp_path / name, clock_epoch="unix", crs=crs)
+    export(sea, "nmea", tmp_path / "a.nmea", clock_epoch="unix")
+    again = readers.load(tmp_path / "a.nmea")
+    assert (again.heights, again.mount("gnss").above_sea) == (ABOVE_SEA, True)
 
 
 def test_a_system_holds_in_its_area_and_a_few_degrees_around():

@@ -13,6 +13,7 @@ from lxml import html
 from pyproj import Transformer
 
 from smartnav_graph.core.errors import ConfigError, SessionError
+from smartnav_graph.core.frames import ABOVE_SEA
 from smartnav_graph.estimate.both_ways import BothWays
 from smartnav_graph.estimate.config import Config, ReportConfig, RunConfig
 from smartnav_graph.evaluation import evaluate
@@ -71,6 +72,9 @@ def test_datum_and_heights(tmp_path, case):
     assert "49.011000" in found["Coordinates"][1] and found["Heights"] == ["Results: above the ellipsoid WGS 84"]
     sea = case.session.replace(sensors={"gnss": Mount(frame="msl", geoid_m=47.5)})
     assert facts(page(tmp_path, case, session=sea))["Heights"][1] == "GNSS: recorded above the sea, geoid at 47.50 m"
+    unknown = page(tmp_path, case, solution=replace(case.solution, heights=ABOVE_SEA))
+    assert facts(unknown)["Heights"] == ["Results: above mean sea level (geoid not known)"]
+    assert "ellipsoid" not in unknown.text_content()
     local = page(tmp_path, case, session=Session(), solution=replace(case.solution, origin=None))
     assert "no geodetic datum" in facts(local)["Coordinates"][0]
     assert facts(local)["Heights"] == ["Results: above the local origin"]
