@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from smartnav_graph.core import chi_square, figures
 from smartnav_graph.core.arrays import Floats, Mask, Times
 from smartnav_graph.core.display import Summarised
+from smartnav_graph.core.errors import InputTypeError
 from smartnav_graph.core.so3 import log, rotate_back
 from smartnav_graph.core.timebase import NS, seconds_since
 from smartnav_graph.evaluation.align import (
@@ -34,6 +35,7 @@ from smartnav_graph.evaluation.align import (
     states_of_solution,
 )
 from smartnav_graph.graph.solution import POS, ROT, VEL, Solution
+from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import Reference
 
 LEAST_FOR_PERCENTILES = 20  # errors: the 95 % percentile is then below the largest
@@ -157,7 +159,7 @@ class Evaluation(Summarised):
 
 def evaluate(
     solution: Solution,
-    reference: Reference,
+    reference: Reference | Session,
     *,
     align: str = "none",
     time_offset_s: float | Literal["auto"] = 0.0,
@@ -172,6 +174,7 @@ def evaluate(
 
     Parameters
     ----------
+    reference : or a session that has one
     align : ``none``, ``yaw`` (vertical rotation and translation), ``se3`` or ``sim3``
     time_offset_s : a reference stamp t is solution time t + offset; ``auto`` finds it (`find_time_offset`)
     rpe_deltas_s : seconds between the ends of the motions whose error is reported
@@ -181,7 +184,10 @@ def evaluate(
     ------
     SessionError
         No reference stamp lies inside the run; unknown alignment, or one the positions do not determine.
+    InputTypeError
+        No solution, or neither a reference nor a session that has one.
     """
+    reference = _compared(solution, reference)
     offset_s = find_time_offset(solution, reference, align) if time_offset_s == "auto" else float(time_offset_s)
     estimate, whole = states_of_solution(solution), states_of_reference(reference, round(offset_s * NS))
     check_overlap(estimate, whole, solution.t0_ns, offset_s)
@@ -209,6 +215,19 @@ def evaluate(
         sigma_enu=np.sqrt(np.clip(np.diagonal(matched.covariance, axis1=1, axis2=2)[:, POS], 0.0, None)),
         notes=notes,
     )
+
+
+def _compared(solution: Solution, reference: Reference | Session) -> Reference:
+    """The reference, also that of a session; both arguments checked."""
+    if not isinstance(solution, Solution):
+        remedy = "sn.smooth(session) gives one; a run has it as run.solution"
+        raise InputTypeError("solution", f"is {type(solution).__name__}", "a Solution", remedy)
+    found = reference.reference if isinstance(reference, Session) else reference
+    if not isinstance(found, Reference):
+        what = "is a Session without reference" if isinstance(reference, Session) else f"is {type(found).__name__}"
+        remedy = "sn.load_reference(FILE) reads one"
+        raise InputTypeError("reference", what, "a Reference, or a Session that has one", remedy)
+    return found
 
 
 def aligned(states: StateSeries, alignment: FrameAlignment) -> StateSeries:

@@ -9,6 +9,8 @@ from differences import average_nees_bounds
 from planted_run import make_reference, make_solution
 from scipy.spatial.transform import Rotation
 
+import smartnav_graph as sn
+from smartnav_graph.core.errors import InputTypeError
 from smartnav_graph.evaluation import Statistics, evaluate
 from smartnav_graph.evaluation.metrics import nees, nees_verdict
 
@@ -185,3 +187,15 @@ def test_nees_in_words_counts_independent_errors(scale, constant, verdict):
     covariances = np.tile(np.eye(3), (400, 1, 1))
     average = float(nees(scale * errors, covariances).mean())
     assert nees_verdict(average, scale * errors, covariances) == verdict
+
+
+def test_a_session_stands_for_its_reference(seconds):
+    solution, reference = make_solution(seconds), make_reference(seconds)
+    session = sn.simulate("figure-eight-60s", 1).replace(reference=reference)
+    assert evaluate(solution, session).ape_m == evaluate(solution, reference).ape_m
+    with pytest.raises(InputTypeError, match="reference: is a Session without reference; expected a Reference, or a"):
+        evaluate(solution, session.replace(reference=None))
+    with pytest.raises(InputTypeError, match="reference: is str; expected a Reference"):
+        evaluate(solution, "truth.csv")
+    with pytest.raises(InputTypeError, match="solution: is Session; expected a Solution; sn.smooth"):
+        evaluate(session, reference)
