@@ -185,7 +185,7 @@ def run(
     import dataclasses
 
     from smartnav_graph.core.errors import ConfigError, InputTypeError, warn
-    from smartnav_graph.estimate.config import Config, RunConfig
+    from smartnav_graph.estimate.config import Config, RunConfig, given_options
     from smartnav_graph.estimate.replay import replay
     from smartnav_graph.estimate.run import smooth
     from smartnav_graph.output.progress import progress as shown
@@ -203,7 +203,7 @@ def run(
     if unknown:
         raise ConfigError("smooth", f"unknown option {', '.join(unknown)}", f"some of {', '.join(known)}")
     config = config or Config()
-    config = dataclasses.replace(config, run=dataclasses.replace(config.run, **options))
+    config = dataclasses.replace(config, run=dataclasses.replace(config.run, **given_options(options)))
     estimate = replay if causal else smooth
     if callable(progress):
         found = estimate(session, config, progress=progress)

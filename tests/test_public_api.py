@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 import smartnav_graph as sn
-from smartnav_graph.estimate.config import RunConfig, RunOptions
+from smartnav_graph.estimate.config import RunConfig, RunOptions, given_options
 from smartnav_graph.graph.solution import SIGMA_NAMES
 
 matplotlib.use("Agg")
@@ -86,6 +86,11 @@ def test_replay_gives_what_was_known_at_the_time():
 def test_an_unknown_option_is_named():
     with pytest.raises(sn.SmartnavError, match="unknown option vehicel; expected some of vehicle, sensors"):
         sn.smooth(sn.simulate("figure-eight-60s"), vehicel="car")
+
+
+def test_a_rate_may_be_a_number_and_what_is_withheld_a_text():
+    assert given_options({"rate": 10, "withhold": "gnss:every=5"}) == {"rate": "10", "withhold": ("gnss:every=5",)}
+    assert given_options({"rate": "imu", "withhold": ("a", "b")}) == {"rate": "imu", "withhold": ("a", "b")}
 
 
 # What a notebook shows.

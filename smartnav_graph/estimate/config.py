@@ -90,6 +90,18 @@ class RunOptions(TypedDict, total=False):
     passes: int
 
 
+def given_options(options: RunOptions) -> RunOptions:
+    """Options as `RunConfig` has them: a rate may be a number, and what is withheld a single text."""
+    found = options.copy()
+    rate: object = options.get("rate")
+    withhold: object = options.get("withhold")
+    if isinstance(rate, int | float) and not isinstance(rate, bool):
+        found["rate"] = str(rate)
+    if isinstance(withhold, str):
+        found["withhold"] = (withhold,)
+    return found
+
+
 @dataclass(frozen=True)
 class ReportConfig:
     """What the report shows beside the run.

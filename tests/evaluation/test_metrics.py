@@ -193,9 +193,9 @@ def test_a_session_stands_for_its_reference(seconds):
     solution, reference = make_solution(seconds), make_reference(seconds)
     session = sn.simulate("figure-eight-60s", 1).replace(reference=reference)
     assert evaluate(solution, session).ape_m == evaluate(solution, reference).ape_m
-    with pytest.raises(InputTypeError, match="reference: is a Session without reference; expected a Reference, or a"):
+    with pytest.raises(InputTypeError, match=r"reference: is a Session without reference; expected a Reference, or a"):
         evaluate(solution, session.replace(reference=None))
-    with pytest.raises(InputTypeError, match="reference: is str; expected a Reference"):
+    with pytest.raises(InputTypeError, match=r"reference: is str; expected a Reference"):
         evaluate(solution, "truth.csv")
-    with pytest.raises(InputTypeError, match="solution: is Session; expected a Solution; sn.smooth"):
+    with pytest.raises(InputTypeError, match=r"solution: is Session; expected a Solution; sn\.smooth"):
         evaluate(session, reference)
