@@ -9,7 +9,9 @@ solution hides (Shin, El-Sheimy 2002, Optimizing smoothing computation for near 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,9 @@ from smartnav_graph.core.progress import Progress, silent
 from smartnav_graph.core.timebase import NS, interpolate
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.replay import replay
+from smartnav_graph.factors.pose_fix import undo_latency
 from smartnav_graph.graph.solution import POS, Solution
+from smartnav_graph.session.calibration.model import Calibration
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.stream import Stream
 
@@ -49,7 +53,18 @@ def reversed_session(session: Session) -> Session:
     left_out = dict.fromkeys((*IMAGES, "reference"))
     streams = {name: _reversed(s, sum_ns) for name, s in session.streams().items() if name not in left_out}
     device = replace(session.device, forward=_OTHER[session.device.forward[0]] + session.device.forward[1])
-    return session.replace(**(streams | left_out), device=device)
+    return session.replace(**(streams | left_out), device=device, calibration=_reversed_bias(session.calibration))
+
+
+def _reversed_bias(calibration: Calibration | None) -> Calibration | None:
+    """Of a gyro with the other sign."""
+    if calibration is None:
+        return None
+    errors = calibration.imu_errors
+    x, y, z = errors.gyro_bias
+    by_temperature = tuple(-value for value in errors.gyro_temperature)
+    errors = replace(errors, gyro_bias=(-x, -y, -z), gyro_temperature=by_temperature)
+    return replace(calibration, imu_errors=errors)
 
 
 def _reversed(stream: Stream, sum_ns: int) -> Stream:
@@ -72,7 +87,9 @@ def both_ways(session: Session, config: Config, progress: Progress = silent) -> 
     imu = session.require_imu()
     first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
     length_s = (last - first) / NS
-    plain = replace(config, replay=replace(config.replay, polish=False), run=replace(config.run, withhold=()))
+    session, latest = undo_latency(session, config.pose_fixes), replace(config.pose_fixes, latency_s=0.0)
+    changes: dict[str, Any] = {"replay": replace(config.replay, polish=False), "pose_fixes": latest}
+    plain = dataclasses.replace(config, **changes, run=replace(config.run, withhold=()))
     start, end = plain.run.start_s, plain.run.end_s
     swapped = replace(
         plain.run,

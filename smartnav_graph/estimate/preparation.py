@@ -156,6 +156,7 @@ def choose_sensors(session: Session, notes: Notes) -> Session:
     if "images" not in unwanted or fixes is None or fixes.source is None:
         return session
     own = fixes.source.astype(str) != OF_A_MODEL
+    notes.drop("of images", {"pose_fixes": int((~own).sum())})
     return session.replace(pose_fixes=fixes.take(own) if own.any() else None)
 
 

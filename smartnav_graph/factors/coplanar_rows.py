@@ -6,8 +6,8 @@ Camera poses follow from those of the body at the two keyframes, R_i, p_i and R_
     c0_R_c1 = C^T D C,      c0_t_c1 = C^T (m - l),      l = body_t_cam
 
 with the boresight correction a as a state (A) where asked, and the clock offset d of the camera (T): the images show
-the poses d later, R Exp(w d) and p + v d. With a focal length that is f longer (I) all coordinates are 1 + f times
-larger. An error of the principal point is a boresight, but for what is far from the axis.
+the poses d later, R Exp(w d) and p + v d. Where the focal length given is too long by the share f (I), all coordinates
+are 1 + f times what it says. An error of the principal point is a boresight, but for what is far from the axis.
 
 A match is one Sampson residual; its derivatives go by the six components of the relative pose. The normal equations of
 a pair in them have six rows at most, which say the same as all of its matches: A^T A = sum w J^T J. A seventh row

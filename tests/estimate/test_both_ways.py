@@ -8,6 +8,7 @@ import pytest
 import smartnav_graph as sn
 from smartnav_graph.estimate.both_ways import both_ways, reversed_session
 from smartnav_graph.estimate.config import RunConfig
+from smartnav_graph.session.calibration.model import Calibration, ImuErrors
 from smartnav_graph.simulation.scenarios import simulate
 
 
@@ -43,3 +44,12 @@ def test_a_heading_that_one_way_cannot_know_is_in_the_difference(drive):
     inside, before = (t > 45.0) & (t < 75.0), (t > 15.0) & (t < 30.0)
     assert found.sigma[inside, :2].mean() > 3.0 * found.sigma[before, :2].mean()
     assert np.abs(found.difference[inside]).max() < 5.0 * found.sigma[inside].max()
+
+
+def test_a_known_bias_of_the_gyro_has_the_other_sign_backward(drive):
+    errors = ImuErrors(gyro_bias=(0.1, 0.0, -0.2))
+    known = drive.replace(calibration=Calibration(imu_errors=errors))
+    back = reversed_session(known)
+    assert back.calibration.imu_errors.gyro_bias == (-0.1, 0.0, 0.2)
+    ahead = errors.corrected(known.imu, None).gyro
+    assert back.calibration.imu_errors.corrected(back.imu, None).gyro == pytest.approx(-ahead[::-1])

@@ -56,8 +56,8 @@ class SolvedProblem:
 
 @dataclass(frozen=True)
 class Withheld(Summarised):
-    """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes; sigma (n, 3) m
-    of that difference, NaN for rows without a sigma of their own."""
+    """Withheld rows of one sensor: stamps (n,) and predicted minus recorded position (n, 3) m, nav axes, NaN where the
+    row has no height; sigma (n, 3) m of that difference, NaN for rows without a sigma of their own."""
 
     t_ns: NDArray[np.int64]
     error: Floats
@@ -65,12 +65,12 @@ class Withheld(Summarised):
 
     def facts(self) -> dict[str, str]:
         """Rows and RMS of the errors."""
-        rms = np.sqrt((self.error**2).sum(axis=1).mean()) if len(self.error) else np.nan
+        rms = np.sqrt(np.nansum(self.error**2, axis=1).mean()) if len(self.error) else np.nan
         return {"rows": str(len(self.t_ns)), "RMS": f"{rms:.3f} m"}
 
     def to_dict(self) -> dict[str, float | int]:
-        """Count, horizontal and 3-D RMS, largest 3-D error, metres."""
-        square = self.error**2
+        """Count, horizontal and 3-D RMS, largest 3-D error, metres; unknown heights do not count."""
+        square = np.nan_to_num(self.error**2)
         return {
             "count": len(self.error),
             "rms_horizontal_m": float(np.sqrt(square[:, :2].sum(axis=1).mean())),
@@ -224,6 +224,7 @@ def score_holdout(problem: Problem, keyframes: Solution, estimate: Estimate) -> 
         variance = np.diagonal(keyframes.covariance[nearest][:, POS, POS], axis1=1, axis2=2)
         own = np.full(p.shape, np.nan) if rows.sigma is None else rows.sigma
         error = p - problem.session.nav_position(rows)
+        error[~rows.has_height, 2] = np.nan
         scored[name] = Withheld(rows.t_ns, error, np.sqrt(np.clip(variance, 0.0, None) + own**2))
     return scored
 

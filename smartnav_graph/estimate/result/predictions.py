@@ -46,7 +46,8 @@ def withheld_points(inputs: VerdictInputs) -> Iterator[Reason]:
     for k in np.flatnonzero(off > CONTRARY_POINT)[:1]:
         name = points.point_id[np.searchsorted(points.t_ns, held.t_ns[k])]
         more = int((off > CONTRARY_POINT).sum()) - 1
-        text = f"withheld control point {name} is {np.linalg.norm(held.error[k]):.2f} m off, {off[k]:.0f} sigma"
+        apart = np.sqrt(np.nansum(held.error[k] ** 2))
+        text = f"withheld control point {name} is {apart:.2f} m off, {off[k]:.0f} sigma"
         text += f"; so are {more} more" if more else ""
         start = float(inputs.solved.problem.session.seconds(int(held.t_ns[k])))
         yield Reason(LEVELS[1], "control", text, "check the point, its sigma and the time of the visit", off[k], start)

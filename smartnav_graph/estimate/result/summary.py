@@ -66,7 +66,7 @@ POSITIONS_ONLY = "positions only"  # mode without inertial data; see `estimate.c
 
 
 def _doubts(estimate: Estimate, mode: str, chi2: float, extra: Mapping[str, Any]) -> list[str]:
-    doubts = [HEADING_UNKNOWN] * (extra.get("heading_known") is False)
+    doubts = [HEADING_UNKNOWN] * (extra.get("heading_known") is False and mode != POSITIONS_ONLY)
     if mode not in ("batch", POSITIONS_ONLY):
         relative = mode.replace("dead-", "dead ")
         doubts.append(f"{relative}: no absolute position measurement, errors grow with time; add position fixes")

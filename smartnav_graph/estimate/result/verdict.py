@@ -91,7 +91,7 @@ LIMITS = {
     "stretch": Limit(
         0.05, 5.0, "positions {axis} are {percent:+.0f} % too far apart", "check units and projection of its positions"
     ),
-    "focal length": Limit(0.015, 5.0, "the motion fits a focal length {percent:+.1f} % longer", "calibrate the camera"),
+    "focal length": Limit(0.015, 5.0, "the focal length given is {percent:+.1f} % too long", "calibrate the camera"),
     "gyro scale": Limit(0.02, 5.0, "gyro " + _SCALED, "calibrate the gyroscope, or check its axes and unit"),
 }
 

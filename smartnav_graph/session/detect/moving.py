@@ -237,15 +237,18 @@ class _Speeds:
     sigma: Floats
 
     def moving(self, begin: int, end: int) -> Iterator[Moving]:
-        """Where the median of some readings is a significant speed, from a second before it is known, and some of them
-        lie in the standstill from `begin` to `end`: a device may stop between two readings."""
+        """Where the median of some readings is a significant speed, from a second before it is known, and those of them
+        in the standstill from `begin` to `end` agree: a device may stop between two readings."""
         inside = (self.t_ns >= begin) & (self.t_ns <= end)
-        needed = min(LEAST_INSIDE, int(inside.sum()))
         later = np.append(self.t_ns[1:], self.t_ns[-1] + round(READINGS_S * NS))
         after = int(np.searchsorted(self.t_ns, end + LONGEST_S * NS, side="right"))
         for k in range(max(LEAST_READINGS - 1, int(np.searchsorted(self.t_ns, begin)) - 1), after):
             first = min(k + 1 - LEAST_READINGS, int(np.searchsorted(self.t_ns, self.t_ns[k] - READINGS_S * NS)))
-            if self.t_ns[k] - self.t_ns[first] > LONGEST_S * NS or inside[first : k + 1].sum() < needed:
+            own = np.flatnonzero(inside[first : k + 1]) + first
+            needed = LEAST_INSIDE if self.t_ns[k] <= end else min(LEAST_INSIDE, int(inside.sum()))
+            if self.t_ns[k] - self.t_ns[first] > LONGEST_S * NS or len(own) < needed:
+                continue
+            if len(own) and np.linalg.norm(np.median(self.v[own], axis=0)) < LEAST_SPEED:
                 continue
             speed = float(np.linalg.norm(np.median(self.v[first : k + 1], axis=0)))
             if speed > max(LEAST_SPEED, SIGNIFICANT * float(np.median(self.sigma[first : k + 1]))):

@@ -10,6 +10,7 @@ import smartnav_graph as sn
 from smartnav_graph.core.timebase import NS
 from smartnav_graph.estimate.config import Config
 from smartnav_graph.estimate.problem import prepare
+from smartnav_graph.session.detect.moving import _Speeds
 from smartnav_graph.session.session import Session
 from smartnav_graph.session.streams import GnssFix, Imu, WheelSpeed
 from smartnav_graph.vision.pairs import Pairs
@@ -138,3 +139,11 @@ def test_speeds_before_a_rest_do_not_refute_it(last_moving_s, lost_s):
     without = at_rest_s(session)
     assert without == pytest.approx(100.0, abs=1.0)
     assert at_rest_s(session.replace(wheel=wheel)) == pytest.approx(without - lost_s, abs=1.0)
+
+
+def test_a_stop_with_one_reading_in_it_is_not_refuted_by_those_around_it():
+    t_ns = np.arange(20) * NS
+    speed = np.where(np.arange(20) == 10, 0.0, 5.0)[:, None]
+    readings = _Speeds(t_ns, t_ns, speed, np.full(20, 0.05))
+    assert not list(readings.moving(round(9.6 * NS), round(10.4 * NS)))
+    assert list(readings.moving(round(4.6 * NS), round(5.4 * NS)))
