@@ -147,3 +147,11 @@ def test_the_rules_see_violations():
     source = "def f(x: Any) -> dict[str, Any]:\n    return {}\n\nclass _C:\n    def g(self):\n        pass\n"
     assert count_any(ast.parse(source)) == 2 and public_names(ast.parse(source)) == {"f"}
     assert lengths(ast.parse(source)) == {"f": 2, "g": 2}
+
+
+def test_files_of_tests_have_names_of_their_own():
+    """Those in folders that are no packages: pytest imports them by name alone."""
+    files = [
+        file.name for file in Path(__file__).parent.rglob("test_*.py") if not (file.parent / "__init__.py").exists()
+    ]
+    assert not {file for file in files if files.count(file) > 1}
