@@ -49,11 +49,11 @@ class Notes:
     rests: Standstills | None = None
     heights: dict[str, HeightLevels] = field(default_factory=dict)
 
-    def uses(self, sensor: str) -> bool:
-        """Whether the options leave a sensor in."""
-        named = self.config.run.sensors
-        chosen = all(name.startswith("-") for name in named) or sensor in named
-        return chosen and f"-{sensor}" not in named
+    def uses(self, *names: str) -> bool:
+        """Whether the options leave in what goes by any of these names."""
+        chosen = self.config.run.sensors
+        wanted = all(name.startswith("-") for name in chosen) or any(name in chosen for name in names)
+        return wanted and not any(f"-{name}" in chosen for name in names)
 
     def drop(self, reason: str, counts: Mapping[str, int]) -> None:
         """Count rows that are not used, by stream."""

@@ -141,19 +141,14 @@ def choose_sensors(session: Session, notes: Notes) -> Session:
     if not chosen:
         return session
     there = session.streams()
-    names = {name.lstrip("-") for name in chosen}
-    unknown = sorted(names - set(there))
+    unknown = sorted({name.lstrip("-") for name in chosen} - set(there))
     if unknown:
         raise ConfigError("--sensors", f"{', '.join(unknown)} not in this session", f"some of {', '.join(there)}")
-    wanted = {name for name in chosen if not name.startswith("-")}
-    unwanted = {name[1:] for name in chosen if name.startswith("-")}
-    of_images = {"matches", "tracks"}
-    wanted |= of_images if "images" in wanted else set()
-    unwanted |= of_images if "images" in unwanted else set()
-    keep = (wanted or set(there)) - unwanted | {"imu", "reference", "images"}
+    also = {"matches": ("images",), "tracks": ("images",)}
+    keep = {name for name in there if notes.uses(name, *also.get(name, ()))} | {"imu", "reference", "images"}
     session = session.replace(**{name: None for name in there if name not in keep})
     fixes = session.pose_fixes
-    if "images" not in unwanted or fixes is None or fixes.source is None:
+    if "-images" not in chosen or fixes is None or fixes.source is None:
         return session
     own = fixes.source.astype(str) != OF_A_MODEL
     notes.drop("of images", {"pose_fixes": int((~own).sum())})

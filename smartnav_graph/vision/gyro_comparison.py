@@ -158,7 +158,7 @@ def _comparison(problem: _Problem, found: _Rotations, x: Floats, bias: Floats, s
     covariance = np.linalg.inv(found.normal.sum(axis=0) + PRIOR)
     parts = [part for part in np.array_split(np.argsort(problem.t0), _blocks(len(problem.t0))) if len(part)]
     weight = np.array([found.normal[part, 6, 6].sum() for part in parts]) + 1e-12
-    own = np.array([-found.right[part, 6].sum() for part in parts]) / weight
+    own = np.array([found.scores[part, 6].sum() for part in parts]) / weight
     at = np.array([np.average(problem.t0[part], weights=found.normal[part, 6, 6] + 1e-12) for part in parts])
     spread = float(np.sqrt(np.average(own**2, weights=weight)))
     drift, formal = 0.0, float(np.sqrt(covariance[6, 6]))
@@ -221,14 +221,14 @@ class _Rotations(NamedTuple):
 
     cost: Floats
     normal: Floats
-    right: Floats
+    scores: Floats
     sound: NDArray[np.bool_]
 
     def step(self, x: Floats, bias: Floats) -> Floats:
         """Gauss-Newton step from x, where `bias` was taken out before."""
         from_prior = PRIOR @ (x + np.concatenate([np.zeros(3), bias, np.zeros(1)]))
         from_prior[6] = 0.0
-        return np.asarray(-np.linalg.solve(self.normal.sum(axis=0) + PRIOR, self.right.sum(axis=0) + from_prior))
+        return np.asarray(np.linalg.solve(self.normal.sum(axis=0) + PRIOR, self.scores.sum(axis=0) - from_prior))
 
 
 class _Problem(NamedTuple):
@@ -306,4 +306,4 @@ class _Problem(NamedTuple):
         least = 1e-9 * (1.0 + np.einsum("nka,nk,nka->n", own, weight, own))  # of a pair without parallax
         normal, scores = eliminated(J, own, white, weight, least[:, None, None] * np.eye(2))
         sound = ((np.abs(white) < 4.0) & there).sum(axis=1) >= 0.5 * pairs.count
-        return _Rotations((cost * there).sum(axis=1), normal, -scores, sound)
+        return _Rotations((cost * there).sum(axis=1), normal, scores, sound)

@@ -1,10 +1,10 @@
 """Cameras of others: each fault of a calibration or a start is found, or the images count for less."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from planted_faults import focal_length
 from scipy.spatial.transform import Rotation
 
 import smartnav_graph as sn
@@ -13,13 +13,19 @@ from smartnav_graph.core.so3 import best_rotation
 CASES = "vision_cases"
 
 
+def off_reference(session, run):
+    """Rows of the solution and of the reference with the same stamp, and the horizontal errors (n, 2) m there."""
+    truth, found = session.reference, run.solution
+    rows, at = np.isin(found.t_ns, truth.t_ns), np.isin(truth.t_ns, found.t_ns)
+    return rows, at, (found.nav_t_body[rows] - truth.enu[at])[:, :2]
+
+
 @pytest.mark.parametrize("name", ["F3_car_klt_worse", "F3_car_orb"])
 def test_a_car_with_every_tenth_fix_is_better_for_its_images(dataset, name):
     session = sn.load(dataset(CASES) / name)
     run = sn.run(session, withhold=("gnss:every=10",), rate="10")
     truth, found = session.reference, run.solution
-    rows, at = np.isin(found.t_ns, truth.t_ns), np.isin(truth.t_ns, found.t_ns)
-    off = (found.nav_t_body[rows] - truth.enu[at])[:, :2]
+    rows, at, off = off_reference(session, run)
     turned = Rotation.from_matrix(found.nav_R_body[rows]) * Rotation.from_quat(truth.quat[at], scalar_first=True).inv()
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.40  # m; 0.48 without images
     assert np.degrees(np.sqrt((turned.as_rotvec()[:, 2] ** 2).mean())) < 0.35  # deg; 4.5 without images
@@ -32,13 +38,7 @@ def test_a_car_with_every_tenth_fix_is_better_for_its_images(dataset, name):
 @pytest.mark.parametrize("name", ["F3_car_klt_worse", "F3_car_orb"])
 def test_a_focal_length_3_percent_too_short_is_found(dataset, name):
     """Coordinates of the images by a focal length that is that much too short are too large."""
-    session, changes = sn.load(dataset(CASES) / name), {}
-    if session.tracks is not None:
-        changes["tracks"] = replace(session.tracks, xy_n=1.03 * session.tracks.xy_n)
-    if session.matches is not None:
-        matches = session.matches
-        changes["matches"] = replace(matches, xy0_n=1.03 * matches.xy0_n, xy1_n=1.03 * matches.xy1_n)
-    wrong = session.replace(**changes)
+    wrong = focal_length(1.0 / 1.03)(sn.load(dataset(CASES) / name), np.random.default_rng(0))
     run = sn.run(wrong, withhold=("gnss:every=10",), rate="10")
     assert run.summary["states"]["camera_focal_length_correction"]["value"] == pytest.approx(-0.03, abs=0.008)
     assert any("focal length" in reason["text"] for reason in run.summary["verdict"]["reasons"])
@@ -48,9 +48,7 @@ def test_fixes_of_a_decimetre_keep_a_car_where_it_is(dataset):
     """All fixes: images that contradict them bend the path by centimetres, and the run is not good."""
     session = sn.load(dataset(CASES) / "F3_car_orb")
     run = sn.run(session, rate="10")
-    truth, found = session.reference, run.solution
-    rows, at = np.isin(found.t_ns, truth.t_ns), np.isin(truth.t_ns, found.t_ns)
-    off = (found.nav_t_body[rows] - truth.enu[at])[:, :2]
+    _, _, off = off_reference(session, run)
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.15  # m; 0.074 without images, 0.81 with the weight of their matches
     assert run.summary["verdict"]["level"] == "doubtful"
 

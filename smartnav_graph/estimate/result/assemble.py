@@ -15,7 +15,7 @@ from smartnav_graph.core.arrays import Floats
 from smartnav_graph.core.display import Summarised
 from smartnav_graph.core.errors import SessionError
 from smartnav_graph.core.so3 import rotate
-from smartnav_graph.core.timebase import NS, interpolate, ns_from_seconds
+from smartnav_graph.core.timebase import NS, interpolate, nearest, ns_from_seconds
 from smartnav_graph.estimate.problem import TOO_LATE, Problem
 from smartnav_graph.estimate.reweight.outliers import FixResiduals, fix_residuals, position_builders
 from smartnav_graph.estimate.reweight.track_outliers import whitened
@@ -220,12 +220,11 @@ def score_holdout(problem: Problem, keyframes: Solution, estimate: Estimate) -> 
             continue
         lever = problem.session.lever_arms(rows) + estimate.session_value(f"{name}_lever_arm_correction_m", 3)
         p = predict_sensor(problem, keyframes, rows.t_ns, estimate.offset_s(name), lever)
-        nearest = np.searchsorted(keyframes.t_ns[:-1] + np.diff(keyframes.t_ns) // 2, rows.t_ns)
-        variance = np.diagonal(keyframes.covariance[nearest][:, POS, POS], axis1=1, axis2=2)
+        sigma = keyframes.sigmas[nearest(rows.t_ns, keyframes.t_ns), POS]
         own = np.full(p.shape, np.nan) if rows.sigma is None else rows.sigma
         error = p - problem.session.nav_position(rows)
         error[~rows.has_height, 2] = np.nan
-        scored[name] = Withheld(rows.t_ns, error, np.sqrt(np.clip(variance, 0.0, None) + own**2))
+        scored[name] = Withheld(rows.t_ns, error, np.hypot(sigma, own))
     return scored
 
 

@@ -43,14 +43,16 @@ def withheld_points(inputs: VerdictInputs) -> Iterator[Reason]:
     if held is None or not isinstance(points, ControlPoint):
         return
     off = np.nan_to_num(np.abs(held.error / held.sigma)).max(axis=1)
-    for k in np.flatnonzero(off > CONTRARY_POINT)[:1]:
-        name = points.point_id[np.searchsorted(points.t_ns, held.t_ns[k])]
-        more = int((off > CONTRARY_POINT).sum()) - 1
-        apart = np.sqrt(np.nansum(held.error[k] ** 2))
-        text = f"withheld control point {name} is {apart:.2f} m off, {off[k]:.0f} sigma"
-        text += f"; so are {more} more" if more else ""
-        start = float(inputs.solved.problem.session.seconds(int(held.t_ns[k])))
-        yield Reason(LEVELS[1], "control", text, "check the point, its sigma and the time of the visit", off[k], start)
+    contrary = np.flatnonzero(off > CONTRARY_POINT)
+    if not len(contrary):
+        return
+    k, more = contrary[0], len(contrary) - 1
+    name = points.point_id[np.searchsorted(points.t_ns, held.t_ns[k])]
+    apart = np.sqrt(np.nansum(held.error[k] ** 2))
+    text = f"withheld control point {name} is {apart:.2f} m off, {off[k]:.0f} sigma"
+    text += f"; so are {more} more" if more else ""
+    start = float(inputs.solved.problem.session.seconds(int(held.t_ns[k])))
+    yield Reason(LEVELS[1], "control", text, "check the point, its sigma and the time of the visit", off[k], start)
 
 
 def fixes_left_out(inputs: VerdictInputs) -> Iterator[Reason]:

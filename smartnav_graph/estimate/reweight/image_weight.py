@@ -34,8 +34,9 @@ CONTRARY, RARE = 1.1, 1e-3
 # First and largest sigma of the direction, rad, and the least and most that it grows by in a pass.
 FIRST, LARGEST = float(np.radians(0.5)), float(np.radians(5.0))
 STEP = (1.6, 3.0)
-# Share of a misfit that is left where a larger error of the direction is its cure, and its name among the selections.
-LEFT, LAST_MISFIT = 0.5, "misfit_of_the_last_pass"
+# Share of a misfit that is left where a larger error of the direction is its cure. Name, among the selections,
+# of the misfit with which that error last grew.
+LEFT, LAST_MISFIT = 0.5, "misfit_at_the_last_growth"
 # Mean square of the change of positions by images over what it has by their gain of information, from which it is none:
 # changes are alike for long. Least share of the variance that counts as a gain.
 CHANGED, LEAST_GAIN = 2.0, 0.1

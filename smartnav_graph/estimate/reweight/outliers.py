@@ -75,8 +75,8 @@ def fix_residuals(
     P = estimate.covariance[keyframe][:, :6, :6]
     there = np.concatenate([-skew(rotate(R, lever)), np.broadcast_to(np.eye(3), R.shape)], axis=2)  # of the antenna
     posterior = np.diagonal(there @ P @ there.transpose(0, 2, 1), axis1=1, axis2=2)
-    t_s = np.array([windows[k].t1_ns for k in keyframe], dtype=np.int64) / NS
-    other = _by_clock(builder, v, pass_state) + _by_correlated_error(builder, rows, t_s, pass_state)
+    by_error = _by_correlated_error(builder, rows, estimate.t_ns[keyframe] / NS, pass_state)
+    other = _by_clock(builder, v, pass_state) + by_error
     return FixResiduals(rows, keyframe, residual, sigma, posterior, other)
 
 

@@ -12,7 +12,7 @@ without it; session states that the data do not determine are held at their cali
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -136,14 +136,14 @@ def _update_noise_and_fixes(
         new = replace(new, rejected=outliers)
     names = [name for builder, _ in found.values() for name in (*builder.noise_names, builder.stated_name)]
     change = max((abs(np.log(new.scale(name) / pass_state.scale(name))) for name in names), default=0.0)
-    stated = _square_per_redundancy(found, pass_state, lambda builder: builder.own_sigma)
+    stated = _square_per_redundancy(found, pass_state, stated=True)
     new, calm = _inertial(builders, windows, estimate, pass_state, new, stated)
     if new.rejected != pass_state.rejected:
         return new, False
     settled = calm and change < STEADY
     if not (settled or (new.stage < LAST_STAGE and change < CLOSE)):
         return new, False
-    square = _square_per_redundancy(found, pass_state, lambda builder: np.ones_like(builder.own_sigma))
+    square = _square_per_redundancy(found, pass_state)
     grown = enable_second_stage(builders, estimate, new, square)
     return (grown, grown == new) if settled or grown.stage > new.stage else (new, False)
 
@@ -230,14 +230,15 @@ def enable_second_stage(
 
 
 def _square_per_redundancy(
-    found: Mapping[str, tuple[PositionBuilder, FixResiduals]],
-    pass_state: PassState,
-    of: Callable[[PositionBuilder], Mask],
+    found: Mapping[str, tuple[PositionBuilder, FixResiduals]], pass_state: PassState, *, stated: bool = False
 ) -> float:
-    """Normalised square of the fixes in use, of those rows, over their redundancy, at least 1."""
+    """Normalised square of the fixes in use over their redundancy, at least 1; stated : of those with sigmas of their
+    own."""
     square = redundancy = 0.0
     for name, (builder, one) in found.items():
-        used = pass_state.used(name, one.rows) & of(builder)[one.rows]
+        used = pass_state.used(name, one.rows)
+        if stated:
+            used = used & builder.own_sigma[one.rows]
         square += float(one.square[used].sum())
         redundancy += float(one.redundancy[used].sum())
     return max(1.0, square / redundancy) if redundancy > 0.0 else 1.0
